@@ -1,0 +1,96 @@
+"""Rotations: axis-angle parameters, matrices, and the closed-form alignment of point sets."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxface._types import Array, Float
+
+
+def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    x, y, z = v
+    zero = jnp.zeros_like(x)
+    return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+
+
+def rotation_matrix(axis_angle: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Rodrigues' formula ``R = I + a [w]x + b [w]x^2`` for the rotation vector ``w`` (radians).
+
+    ``a = sin(t)/t`` and ``b = (1 - cos t)/t^2`` with ``t = |w|`` are replaced by their Taylor
+    series for ``t^2 < 1e-3`` (truncation below 2e-14), so all derivatives exist at the identity.
+    """
+    t2 = jnp.sum(axis_angle * axis_angle)
+    small = t2 < 1e-3
+    safe = jnp.where(small, 1.0, t2)
+    t = jnp.sqrt(safe)
+    a_taylor = 1.0 + t2 * (-1.0 / 6.0 + t2 * (1.0 / 120.0 - t2 / 5040.0))
+    b_taylor = 0.5 + t2 * (-1.0 / 24.0 + t2 * (1.0 / 720.0 - t2 / 40320.0))
+    a = jnp.where(small, a_taylor, jnp.sin(t) / t)
+    b = jnp.where(small, b_taylor, (1.0 - jnp.cos(t)) / safe)
+    k = _skew(axis_angle)
+    return jnp.eye(3, dtype=axis_angle.dtype) + a * k + b * (k @ k)
+
+
+def axis_angle(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Rotation vector (radians, norm at most pi) of a rotation matrix, by way of its quaternion.
+
+    The quaternion is read from its largest component (Shepperd 1978), so angles near 0 and near
+    pi are both accurate; at exactly pi the sign of the axis is arbitrary.
+    """
+    m = matrix
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    q = jnp.array(
+        [
+            [1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], 1.0 + 2 * m[0, 0] - trace, m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1.0 + 2 * m[1, 1] - trace, m[2, 1] + m[1, 2]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1.0 + 2 * m[2, 2] - trace],
+        ]
+    )
+    row = q[jnp.argmax(jnp.diagonal(q))]
+    row = row / jnp.sqrt(jnp.sum(row * row))
+    row = jnp.where(row[0] < 0, -row, row)
+    w, v = row[0], row[1:]
+    s2 = jnp.sum(v * v)
+    small = s2 < 1e-8
+    s = jnp.sqrt(jnp.where(small, 1.0, s2))
+    factor = jnp.where(small, 2.0 / w, 2.0 * jnp.arctan2(s, w) / s)
+    return factor * v
+
+
+def similarity_transform(
+    source: Float[Array, "n 3"],
+    target: Float[Array, "n 3"],
+    weights: Float[Array, "n"] | None = None,
+    with_scale: bool = True,
+) -> tuple[Float[Array, ""], Float[Array, "3 3"], Float[Array, "3"]]:
+    """Scale ``s``, rotation ``R`` and translation ``t`` minimising ``sum w |s R x + t - y|^2``.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 1991, with a reflection guarded against. Apply as ``s * x @ R.T + t``.
+    """
+    w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
+    w = w / jnp.sum(w)
+    mean_source = w @ source
+    mean_target = w @ target
+    x, y = source - mean_source, target - mean_target
+    u, singular, vt = jnp.linalg.svd((w[:, None] * y).T @ x)
+    sign = jnp.array([1.0, 1.0, 1.0], source.dtype).at[2].set(jnp.linalg.det(u) * jnp.linalg.det(vt))
+    rotation = (u * sign) @ vt
+    variance = jnp.sum(w[:, None] * x * x)
+    scale = jnp.sum(singular * sign) / variance if with_scale else jnp.ones((), source.dtype)
+    return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
+def euler_yxz(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """(yaw, pitch, roll) in radians with ``R = Ry(yaw) Rx(pitch) Rz(roll)``.
+
+    Yaw is positive when the face turns to its own left (image right), pitch when it looks down.
+    """
+    m = matrix
+    pitch = jnp.arcsin(jnp.clip(-m[1, 2], -1.0, 1.0))
+    return jnp.stack(
+        [jnp.arctan2(m[0, 2], m[2, 2]), pitch, jnp.arctan2(m[1, 0], m[1, 1])]
+    )
+
+
+rotation_matrices = jax.vmap(rotation_matrix)
