@@ -1,0 +1,43 @@
+"""Files that are whole or absent: write beside the target, then rename over it."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to; on success it replaces ``path`` in one step.
+
+    The temporary file lies in the same folder (made if missing), for a rename is atomic only
+    within a file system, and keeps the suffix, for writers choose the format by it. When the body
+    raises, the temporary file is removed and ``path`` is left as it was.
+
+    Args:
+        path: the file to write.
+
+    Yields:
+        The temporary path; the body has to write it.
+
+    Raises:
+        OSError: the folder cannot be made or written to, or the body has written nothing.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(
+        prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent
+    )
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes a private file; an output has the permissions of any other new file.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
