@@ -1,0 +1,18 @@
+"""Per-vertex quantities carried to pixels."""
+
+import jax.numpy as jnp
+
+from jaxface._types import Array, Float, Int
+from jaxface.render.rasterize import Fragments
+
+
+def interpolate(
+    values: Float[Array, "n c"], faces: Int[Array, "f 3"], fragments: Fragments
+) -> Float[Array, "h w c"]:
+    """Perspective-correct interpolation of a per-vertex quantity, zero on the background.
+
+    Differentiable in ``values`` and, through the weights of ``fragments``, in the vertices. Also
+    serves quantities indexed otherwise than the vertices (UV corners with their own ``faces``).
+    """
+    corner = values[faces[jnp.maximum(fragments.triangle, 0)]]
+    return jnp.einsum("hwi,hwic->hwc", fragments.barycentric, corner)
