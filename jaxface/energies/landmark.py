@@ -1,0 +1,98 @@
+"""Landmark term ``E_lan`` (Saito 2017, section 3), with contour points that slide.
+
+``E_lan = 1/|F| sum_i ||f_i - Pi_P(R V_i + t)||_2^2``. The paper leaves the unit of the distance
+open; here it is the distance between the outer eye corners in the photo (``unit``), so that the
+term means the same at every resolution and pyramid level.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxface._types import Array, Bool, Float, Int
+from jaxface.geometry.mesh import vertex_normals
+from jaxface.geometry.rotation import rotation_matrix
+from jaxface.models.morphable import MorphableModel, SurfacePoints
+from jaxface.models.parameters import FaceParameters
+
+
+class LandmarkData(eqx.Module):
+    """Arguments of the landmark energy."""
+
+    model: MorphableModel
+    points: SurfacePoints
+    """where each landmark lies on the mesh"""
+    target: Float[Array, "l 2"]
+    """detected positions f_i (x, y), as fractions of the working image's side"""
+    weight: Float[Array, "l"]
+    """share of each landmark in the mean"""
+    unit: Float[Array, ""]
+    """length that counts as 1, as a fraction of the side"""
+
+
+def landmark_difference(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 2"]:
+    """``Pi_P(R V_i + t) - f_i`` in fractions of the working image's side.
+
+    Only the vertices that carry landmarks are evaluated.
+    """
+    used, model = data.points.vertices, data.model
+    corners = (
+        model.mean[used]
+        + model.identity.basis[used] @ y.identity
+        + model.expression.basis[used] @ y.expression
+    )
+    points = jnp.einsum("li,lij->lj", data.points.weights, corners)
+    posed = points @ rotation_matrix(y.rotation).T + y.translation
+    return y.camera(1).project(posed)[:, :2] - data.target
+
+
+def landmark_residual(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 2"]:
+    """Residual with ``||r||^2 = E_lan``, the weighted mean of squared distances in ``unit``."""
+    share = data.weight / jnp.maximum(jnp.sum(data.weight), 1e-6)
+    return jnp.sqrt(share)[:, None] * landmark_difference(y, data) / data.unit
+
+
+def slide_contour(
+    y: FaceParameters,
+    data: LandmarkData,
+    contour: Bool[Array, "l"],
+    candidates: Int[Array, "c"],
+    reach: float = 0.35,
+) -> LandmarkData:
+    """Move hidden contour landmarks to the silhouette.
+
+    A detector places jaw points on the outline it sees. Once the head turns, the outline is not
+    where the frontal jaw was: a contour landmark whose own surface point faces away from the
+    camera is attached to the candidate vertex on the silhouette that is nearest to its detected
+    position, and loses its weight if none lies within ``reach`` units.
+
+    Args:
+        y: current estimate, held fixed (the choice is discrete; no gradient passes).
+        data: the landmarks.
+        contour: which landmarks may slide.
+        candidates: vertices that may form the silhouette (face, jaw and neck skin).
+        reach: greatest distance, in ``data.unit``, between a detection and its new point.
+    """
+    model = data.model
+    vertices = model.shape(y.identity, y.expression)
+    rotation = rotation_matrix(y.rotation)
+    normals = vertex_normals(vertices, model.faces) @ rotation.T
+    posed = vertices @ rotation.T + y.translation
+    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
+    facing = jnp.sum(normals * view, axis=-1)
+    own_facing = jnp.sum(data.points.weights * facing[data.points.vertices], axis=-1)
+    hidden = contour & (own_facing < 0.05)
+
+    screen = y.camera(1).project(posed[candidates])[:, :2]
+    distance = jnp.linalg.norm(data.target[:, None] - screen[None], axis=-1) / data.unit
+    on_silhouette = jnp.abs(facing[candidates]) < 0.25
+    distance = jnp.where(on_silhouette[None], distance, jnp.inf)
+    best = jnp.argmin(distance, axis=1)
+    near = jnp.min(distance, axis=1) < reach
+    slid = jnp.broadcast_to(candidates[best][:, None], data.points.vertices.shape)
+    vertex_weight = jnp.array([1.0, 0.0, 0.0], model.mean.dtype)
+    points = SurfacePoints(
+        jnp.where((hidden & near)[:, None], slid, data.points.vertices),
+        jnp.where((hidden & near)[:, None], vertex_weight, data.points.weights),
+    )
+    weight = jnp.where(hidden & ~near, 0.0, data.weight)
+    return eqx.tree_at(lambda d: (d.points, d.weight), data, (points, weight))

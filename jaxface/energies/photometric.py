@@ -1,0 +1,140 @@
+"""Photo-consistency ``E_c`` (Saito 2017, section 3) on a list of visible pixels.
+
+``E_c = 1/|M| sum_p ||C_input(p) - C_synth(p)||_2`` over the visible face pixels M: the norm of
+each pixel's colour difference is *not* squared, so that the energy resists outliers.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxface._numerics import safe_norm
+from jaxface._types import Array, Bool, Float, Int
+from jaxface.geometry.mesh import vertex_normals
+from jaxface.geometry.ray import pixel_rays, ray_weights
+from jaxface.geometry.rotation import rotation_matrix
+from jaxface.models.morphable import MorphableModel
+from jaxface.models.parameters import FaceParameters
+from jaxface.render.shading import irradiance
+
+
+class PixelSamples(eqx.Module):
+    """Visible pixels of a photo with the triangle each of them shows (visibility held fixed)."""
+
+    position: Float[Array, "p 2"]
+    """pixel centres (x, y), as fractions of the working image's side"""
+    triangle: Int[Array, "p 3"]
+    """vertex indices of the visible triangle"""
+    color: Float[Array, "p 3"]
+    """C_input, linear RGB"""
+    weight: Float[Array, "p"]
+    """share of the pixel in the mean, in [0, 1]; 0 marks unused entries"""
+
+
+class PhotometricData(eqx.Module):
+    """Arguments of the photometric energy."""
+
+    model: MorphableModel
+    samples: PixelSamples
+
+
+def sample_pixels(
+    image: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    triangle: Int[Array, "h w"],
+    faces: Int[Array, "f 3"],
+    face_mask: Bool[Array, "f"],
+    capacity: int,
+) -> PixelSamples:
+    """Gather the pixels that show an allowed triangle, at most ``capacity`` of them.
+
+    If more are visible, an evenly spread subset (in scan order) stands for all.
+
+    Args:
+        image: square working image, linear RGB.
+        mask: weight of each pixel in [0, 1].
+        triangle: visible triangle of each pixel, -1 for the background.
+        faces: the mesh.
+        face_mask: triangles that take part.
+        capacity: length of the lists.
+    """
+    height, width = triangle.shape
+    flat = triangle.reshape(-1)
+    weights = mask.reshape(-1) * ((flat >= 0) & face_mask[flat])
+    valid = weights > 0
+    rank = jnp.cumsum(valid) - 1
+    count = rank[-1] + 1
+    slots = jnp.arange(capacity)
+    wanted = jnp.where(count > capacity, (slots * (count / capacity)).astype(jnp.int32), slots)
+    index = jnp.searchsorted(rank, jnp.minimum(wanted, count - 1))
+    used = slots < count
+    index = jnp.where(used, index, 0)
+    y, x = index // width, index % width
+    position = (jnp.stack([x, y], axis=-1) + 0.5) / width
+    return PixelSamples(
+        position=position.astype(image.dtype),
+        triangle=jnp.where(used[:, None], faces[flat[index]], 0),
+        color=image.reshape(-1, 3)[index],
+        weight=jnp.where(used, weights[index], 0.0).astype(image.dtype),
+    )
+
+
+def synthesize(
+    y: FaceParameters, model: MorphableModel, samples: PixelSamples
+) -> Float[Array, "p 3"]:
+    """``C_synth``: Lambertian colour (linear RGB) that the model shows at each sample.
+
+    Albedo and the area-weighted vertex normals are interpolated perspective-correctly and shaded
+    by second-order spherical harmonics.
+    """
+    vertices = model.shape(y.identity, y.expression)
+    rotation = rotation_matrix(y.rotation)
+    normals = vertex_normals(vertices, model.faces)
+    used = samples.triangle
+    corners = vertices[used] @ rotation.T + y.translation
+    camera = y.camera(1)
+    weights = ray_weights(pixel_rays(samples.position, camera.focal, camera.principal), corners)
+    normal = jnp.einsum("pi,pij->pj", weights, normals[used]) @ rotation.T
+    normal = normal / jnp.maximum(safe_norm(normal, keepdims=True), 1e-12)
+    albedo = jnp.einsum("pi,pij->pj", weights, model.reflectance(y.albedo)[used])
+    return albedo * irradiance(normal, y.light)
+
+
+def photometric_difference(y: FaceParameters, data: PhotometricData) -> Float[Array, "p 3"]:
+    """``C_input(p) - C_synth(p)`` at each sample (linear RGB), zero at unused entries."""
+    difference = data.samples.color - synthesize(y, data.model, data.samples)
+    return jnp.where(data.samples.weight[:, None] > 0, difference, 0.0)
+
+
+def photometric_energy(y: FaceParameters, data: PhotometricData) -> Float[Array, ""]:
+    """``E_c``: weighted mean over the samples of the norm of the colour difference.
+
+    The derivative of a pixel that matches exactly is taken as zero.
+    """
+    weight = data.samples.weight
+    total = jnp.maximum(jnp.sum(weight), 1.0)
+    return jnp.sum(weight * safe_norm(photometric_difference(y, data))) / total
+
+
+def reweighting(
+    difference: Float[Array, "p 3"], weight: Float[Array, "p"], floor: float = 1e-3
+) -> Float[Array, "p"]:
+    """IRLS weights: ``weight / (2 max(||d||, floor)) / sum(weight)``.
+
+    With these, ``sum_p w_p ||d_p||^2`` has the gradient of ``E_c`` at the current point (and
+    majorises it up to a constant), except where ``||d|| < floor`` (linear RGB), where the norm
+    is replaced by a parabola. No gradient passes through the weights: they are a
+    ``stop_gradient``.
+    """
+    norm = jax.lax.stop_gradient(safe_norm(difference))
+    return weight / (2 * jnp.maximum(norm, floor)) / jnp.maximum(jnp.sum(weight), 1.0)
+
+
+def photometric_residual(y: FaceParameters, data: PhotometricData) -> Float[Array, "p 3"]:
+    """Residual whose squared norm is the IRLS majoriser of ``E_c`` at ``y``.
+
+    ``||r||^2 = E_c / 2`` and ``grad ||r||^2 = grad E_c`` where no pixel is under the floor of
+    ``reweighting``, whose weights are constants (``stop_gradient``).
+    """
+    difference = photometric_difference(y, data)
+    return jnp.sqrt(reweighting(difference, data.samples.weight))[:, None] * difference
