@@ -110,9 +110,7 @@ def test_errors_are_not_swallowed(path: Path) -> None:
 def test_all_names_exist() -> None:
     for path in MODULES:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        bound = {
-            name.id for name in ast.walk(tree) if isinstance(name, ast.Name) and name.ctx is not None
-        }
+        bound = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         bound |= {node.name for node in tree.body if isinstance(node, Definition)}
         bound |= {
             alias.asname or alias.name
@@ -125,7 +123,7 @@ def test_all_names_exist() -> None:
 
 
 def test_the_test_finds_faults() -> None:
-    source = 'def f(x):\n    return x\n\n\nclass _Hidden:\n    def g(self, y): ...\n'
+    source = "def f(x):\n    return x\n\n\nclass _Hidden:\n    def g(self, y): ...\n"
     names = dict(public(ast.parse(source)))
     assert list(names) == ["f"]
     node = names["f"]
