@@ -1,0 +1,133 @@
+"""Masks of an image: filled polygons, erosion and dilation by a disc, soft edges, the face oval."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxface._types import Array, Bool, Float, Shaped
+
+FACE_OVAL_468 = (
+    *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377),
+    *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
+)
+"""The rim of the 468-point MediaPipe face mesh, in order from the middle of the hairline."""
+
+
+def smoothstep(x: Float[Array, "*s"], start: float, stop: float) -> Float[Array, "*s"]:
+    """0 up to ``start``, 1 from ``stop``, the cubic ``t^2 (3 - 2 t)`` between (slope 0 at both)."""
+    t = jnp.clip((x - start) / (stop - start), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def fill_polygon(points: Float[Array, "k 2"], height: int, width: int) -> Bool[Array, "h w"]:
+    """Pixels whose centre lies inside a closed polygon, by the even-odd rule.
+
+    Args:
+        points: corners (x, y) in pixels, in order; they may lie outside the image.
+        height: rows of the image.
+        width: columns of the image.
+    """
+    x = jnp.arange(width, dtype=points.dtype) + 0.5
+    y = jnp.arange(height, dtype=points.dtype)[:, None] + 0.5
+    ends = jnp.roll(points, -1, axis=0)
+    # Half-open in y, so a corner that lies exactly on a row counts once.
+    crosses = (points[:, 1] <= y) != (ends[:, 1] <= y)
+    rise = ends[:, 1] - points[:, 1]
+    along = (y - points[:, 1]) / jnp.where(rise == 0, 1.0, rise)
+    crossing = jnp.where(crosses, points[:, 0] + along * (ends[:, 0] - points[:, 0]), jnp.inf)
+    left_of = jnp.sum(crossing[:, None, :] <= x[:, None], axis=-1)
+    return left_of % 2 == 1
+
+
+def distance_to(mask: Bool[Array, "h w"], limit: int) -> Float[Array, "h w"]:
+    """Euclidean distance (px) from each pixel's centre to the nearest True one, at most ``limit``.
+
+    Exact within the limit. Two passes, as in Felzenszwalb and Huttenlocher, "Distance transforms
+    of sampled functions", 2012: along rows by running maxima, then down columns, where only
+    ``limit`` rows either way can matter. The space beyond the image counts as False.
+
+    Raises:
+        ValueError: ``limit`` is not a positive whole number.
+    """
+    if int(limit) != limit or limit < 1:
+        raise ValueError(f"limit is {limit}; it needs a whole number of pixels, 1 or more")
+    limit = int(limit)
+    height, width = mask.shape
+    column = jnp.arange(width, dtype=jnp.int32)
+    far = width + limit
+    before = column - jax.lax.cummax(jnp.where(mask, column, -far), axis=1)
+    after = jax.lax.cummin(jnp.where(mask, column, width + far), axis=1, reverse=True) - column
+    along = jnp.minimum(jnp.minimum(before, after), limit)
+    row_squared = jnp.pad(along * along, ((limit, limit), (0, 0)), constant_values=limit * limit)
+
+    def lower(step: Array, best: Array) -> Array:
+        rows = jax.lax.dynamic_slice_in_dim(row_squared, step, height)
+        return jnp.minimum(best, rows + (step - limit) ** 2)
+
+    squared = jax.lax.fori_loop(0, 2 * limit + 1, lower, jnp.full((height, width), limit**2))
+    return jnp.sqrt(squared.astype(jnp.result_type(float)))
+
+
+def dilate(mask: Bool[Array, "h w"], radius: float) -> Bool[Array, "h w"]:
+    """Grow a mask by a disc: True where a True pixel's centre is within ``radius`` px.
+
+    Raises:
+        ValueError: ``radius`` is negative.
+    """
+    if radius < 0:
+        raise ValueError(f"radius is {radius}; it needs 0 px or more")
+    return mask if radius < 1 else distance_to(mask, int(radius) + 1) <= radius
+
+
+def erode(mask: Bool[Array, "h w"], radius: float) -> Bool[Array, "h w"]:
+    """Shrink a mask by a disc; the border of the image does not eat into it.
+
+    Raises:
+        ValueError: ``radius`` is negative.
+    """
+    return ~dilate(~mask, radius)
+
+
+def feather(mask: Bool[Array, "h w"], width: float) -> Float[Array, "h w"]:
+    """Soft edge inside a mask: 0 outside, rising smoothly to 1 at ``width`` px from its edge.
+
+    Raises:
+        ValueError: ``width`` is negative.
+    """
+    if width < 0:
+        raise ValueError(f"width is {width}; it needs 0 px or more")
+    if width == 0:
+        return mask.astype(jnp.result_type(float))
+    # A pixel's centre is half a pixel from the edge between it and a neighbour outside.
+    limit = math.ceil(width) + 1
+    return smoothstep(distance_to(~mask, limit) - 0.5, 0.0, width) * mask
+
+
+def face_oval(landmarks: Float[Array, "l 2"], forehead: float = 0.35) -> Float[Array, "k 2"]:
+    """Polygon around the face from 468 (or 478) or 68 landmarks, pixels.
+
+    The 68 points end at the eyebrows: there, the brows pushed away from the chin by ``forehead``
+    times the height from chin to brows stand for the hairline.
+
+    Raises:
+        ValueError: the number of landmarks is not 68, 468 or 478.
+    """
+    count = landmarks.shape[0]
+    if count in (468, 478):
+        return landmarks[jnp.array(FACE_OVAL_468)]
+    if count != 68:
+        raise ValueError(f"landmarks has {count} points; it needs 68, 468 or 478")
+    jaw, brows = landmarks[:17], landmarks[17:27]
+    up = jnp.mean(brows, axis=0) - jaw[8]
+    # Highest in the middle of the forehead, lower towards the temples.
+    arch = jnp.sin(jnp.linspace(0.15, 0.85, 10, dtype=landmarks.dtype) * jnp.pi)[:, None]
+    return jnp.concatenate([jaw, (brows + forehead * arch * up)[::-1]])
+
+
+def face_oval_mask(
+    landmarks: Float[Array, "l 2"], height: int, width: int, soft: float = 0.0
+) -> Shaped[Array, "h w"]:
+    """Filled face oval; with ``soft`` > 0 its edge rises over that many pixels, inwards."""
+    inside = fill_polygon(face_oval(landmarks), height, width)
+    return feather(inside, soft) if soft > 0 else inside
