@@ -1,0 +1,147 @@
+"""The face mesh: 468 points of a face in a 192x192 crop, and whether there is one.
+
+Kartynnik et al., "Real-time Facial Surface Geometry from Monocular Video on Mobile GPUs", 2019.
+Weights: MediaPipe (Apache-2.0).
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._numerics import safe_norm
+from jaxface._types import Array, Float, Int
+from jaxface.imaging.resample import affine_crop
+from jaxface.models.blaze import Convolution, ResidualBlock, chain, read_chain
+from jaxface.models.landmark_schemes import FACE_OVAL as FACE_OVAL
+from jaxface.models.landmark_schemes import MEDIAPIPE_TO_IBUG68 as MEDIAPIPE_TO_IBUG68
+from jaxface.models.landmark_schemes import landmarks68 as landmarks68
+
+CROP_SIZE = 192
+"""side of the network's input, px"""
+
+REGION_MARGIN = 1.5
+"""a region's side over the longer side of the box that it was made from"""
+
+_EYE_CORNERS = (33, 263)
+
+
+class LandmarkNet(eqx.Module):
+    """The network: a trunk, then a branch for the points and one for the presence of a face."""
+
+    trunk: tuple[Convolution | ResidualBlock, ...]
+    points: tuple[Convolution | ResidualBlock, ...]
+    presence: tuple[Convolution | ResidualBlock, ...]
+    mirror: Int[Array, "468"]
+    """index of each point's mirror image"""
+
+    def __call__(
+        self, crop: Float[Array, "192 192 3"]
+    ) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
+        """Points (x, y and relative depth, px of the crop; larger depth is farther) and presence.
+
+        The crop is sRGB-encoded RGB in [0, 1]; presence is a probability.
+        """
+        features = chain(self.trunk, crop)
+        points = _head(self.points[-1], chain(self.points[:-1], features))
+        logit = _head(self.presence[-1], chain(self.presence[:-1], features))
+        return points.reshape(-1, 3), jax.nn.sigmoid(logit[0])
+
+
+def _head(layer: Convolution | ResidualBlock, x: Float[Array, "k k i"]) -> Float[Array, "o"]:
+    # The last convolution covers the whole 3x3 map, without padding.
+    return jnp.einsum("hwi,hwio->o", x, layer.kernel) + layer.bias
+
+
+def read_landmark_net(arrays: Mapping[str, np.ndarray]) -> LandmarkNet:
+    """The network from its named weights (float32)."""
+    return LandmarkNet(
+        trunk=read_chain(arrays, "mesh/trunk", halving=(0, 3, 6, 9, 12)),
+        points=read_chain(arrays, "mesh/points", halving=(0,)),
+        presence=read_chain(arrays, "mesh/presence", halving=(0,)),
+        mirror=jnp.asarray(arrays["mesh/mirror"], jnp.int32),
+    )
+
+
+class Region(eqx.Module):
+    """A rotated square of an image that holds one face."""
+
+    centre: Float[Array, "2"]
+    """x, y px"""
+    side: Float[Array, ""]
+    """px"""
+    angle: Float[Array, ""]
+    """of the eye line from the image's x axis towards its y axis (clockwise on screen), radians"""
+
+    def transform(self, size: int = CROP_SIZE) -> Float[Array, "2 3"]:
+        """Affine map from the coordinates (px) of a square crop of that size to the image's."""
+        scale = self.side / size
+        rotation = rotation_2d(self.angle) * scale
+        corner = self.centre - rotation @ jnp.full(2, size / 2)
+        return jnp.concatenate([rotation, corner[:, None]], axis=1)
+
+
+def rotation_2d(angle: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """Rotation by an angle (radians) from x towards y."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
+
+
+def region_from_eyes(
+    box: Float[Array, "4"], right_eye: Float[Array, "2"], left_eye: Float[Array, "2"]
+) -> Region:
+    """Region for a detected box, upright along the line from the subject's right eye to the left."""
+    across = left_eye - right_eye
+    side = REGION_MARGIN * jnp.max(box[2:] - box[:2])
+    return Region((box[:2] + box[2:]) / 2, side, jnp.arctan2(across[1], across[0]))
+
+
+def region_from_landmarks(landmarks: Float[Array, "468 3"]) -> Region:
+    """Region around known points: square, level with the outer eye corners.
+
+    The box is taken in the rotated frame, so a turned picture gives the same crop.
+    """
+    points = landmarks[:, :2]
+    right, left = (points[i] for i in _EYE_CORNERS)
+    across = left - right
+    angle = jnp.arctan2(across[1], across[0])
+    rotation = rotation_2d(angle)
+    level = points @ rotation
+    low, high = jnp.min(level, axis=0), jnp.max(level, axis=0)
+    return Region(rotation @ ((low + high) / 2), REGION_MARGIN * jnp.max(high - low), angle)
+
+
+def landmarks_in_region(
+    net: LandmarkNet, image: Float[Array, "h w 3"], region: Region
+) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
+    """Points (px of the image, depth on the same scale) and presence of the face in a region.
+
+    Differentiable with respect to the image (sRGB-encoded, [0, 1]) and to the region.
+    """
+    transform = region.transform()
+    crop = affine_crop(image, transform, CROP_SIZE, CROP_SIZE)
+    points, presence = net(crop)
+    flat = points[:, :2] @ transform[:, :2].T + transform[:, 2]
+    depth = points[:, 2:] * (region.side / CROP_SIZE)
+    return jnp.concatenate([flat, depth], axis=1), presence
+
+
+def refine_landmarks(
+    net: LandmarkNet, image: Float[Array, "h w 3"], region: Region, passes: int = 2
+) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
+    """Points and presence after ``passes`` rounds, each in the region of the round before's points."""
+
+    def one_pass(region, _):
+        landmarks, presence = landmarks_in_region(net, image, region)
+        return region_from_landmarks(landmarks), (landmarks, presence)
+
+    _, (landmarks, presence) = jax.lax.scan(one_pass, region, None, length=passes)
+    return landmarks[-1], presence[-1]
+
+
+def inter_ocular_distance(landmarks: Float[Array, "468 3"]) -> Float[Array, ""]:
+    """Distance between the outer eye corners in the image, px."""
+    right, left = (landmarks[i, :2] for i in _EYE_CORNERS)
+    return safe_norm(left - right)
