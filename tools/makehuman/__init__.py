@@ -1,0 +1,1 @@
+"""Build the bundled ``makehuman`` morphable model from CC0 MakeHuman data."""
