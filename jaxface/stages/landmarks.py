@@ -1,0 +1,243 @@
+"""Photo -> faces: where they are, and 468 points on each."""
+
+import functools
+from importlib import resources
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxface._types import Float, Shaped
+from jaxface.imaging.windows import PhotoPyramid
+from jaxface.models.face_detector import (
+    DETECTOR_SIZE,
+    Candidates,
+    FaceDetector,
+    overlap,
+    read_face_detector,
+    suppress,
+)
+from jaxface.models.landmarks_net import (
+    LandmarkNet,
+    Region,
+    read_landmark_net,
+    refine_landmarks,
+    region_from_eyes,
+)
+
+SMALLEST_FACE = 40.0
+"""px; narrower faces are not looked for unless asked"""
+
+# The detector finds faces wider than this share of its picture. Tiles overlap by twice as much,
+# so that any face is whole in one of them until the next coarser tiles can see it.
+_FACE_SHARE = 0.16
+_TILE_STEP = 1 - 2 * _FACE_SHARE
+# Turned photos are tried on the whole and on tiles down to a quarter, where they are few.
+_TURNED_SCALES = 3
+_PATCH_SIZE = 640
+
+
+class NoFaceError(ValueError):
+    """A face is needed and none was found."""
+
+
+class SeveralFacesError(ValueError):
+    """One face is needed and several were found."""
+
+
+class DetectedFace(eqx.Module):
+    """One face in a photo, in the photo's pixels."""
+
+    box: Float[np.ndarray, "4"]
+    """left, top, right, bottom of the landmarks, px"""
+    score: float
+    """the detector's probability"""
+    landmarks: Float[np.ndarray, "468 3"]
+    """MediaPipe face mesh: x, y (px) and relative depth (px, larger is farther)"""
+    presence: float
+    """the landmark network's probability that this is a face"""
+
+    @property
+    def size(self) -> float:
+        """Longer side of the box, px."""
+        return float(np.max(self.box[2:] - self.box[:2]))
+
+
+class LandmarkNetworks(eqx.Module):
+    """The two networks that find faces and their landmarks."""
+
+    detector: FaceDetector
+    mesh: LandmarkNet
+
+
+@functools.cache
+def bundled_networks() -> LandmarkNetworks:
+    """The networks that come with the package (MediaPipe, Apache-2.0)."""
+    path = resources.files("jaxface") / "assets" / "landmark_weights.npz"
+    with resources.as_file(path) as file, np.load(file) as arrays:
+        weights = dict(arrays)
+    return LandmarkNetworks(read_face_detector(weights), read_landmark_net(weights))
+
+
+def detect_faces(
+    image: Shaped[np.ndarray, "h w 3"],
+    *,
+    networks: LandmarkNetworks | None = None,
+    smallest: float | None = None,
+    min_score: float = 0.5,
+    min_presence: float = 0.5,
+) -> list[DetectedFace]:
+    """Find the faces in a photo and their landmarks, largest first.
+
+    The whole photo is looked at first, then overlapping tiles of half its size, a quarter and so
+    on, upright and turned by quarter turns, until a face is found. The landmark network then
+    looks at each face twice, the second time in the region that its own points give.
+
+    Args:
+        image: sRGB-encoded, ``uint8`` or float in [0, 1].
+        networks: the weights; those of the package by default.
+        smallest: look down to faces of this width (px) even when larger ones have been found.
+            By default stop at the first scale with a face, and at ``SMALLEST_FACE`` px.
+        min_score: detections of a lower score are dropped.
+        min_presence: faces of a lower presence are dropped.
+
+    Raises:
+        ValueError: the array is not a photo (shape, type, size, NaN).
+    """
+    nets = bundled_networks() if networks is None else networks
+    photo = PhotoPyramid(np.asarray(image))
+    faces: list[DetectedFace] = []
+    for depth, side in enumerate(_tile_sides(max(photo.size), smallest or SMALLEST_FACE)):
+        for turns in (0, 1, 3, 2) if depth < _TURNED_SCALES else (0,):
+            found = suppress(_candidates(nets, photo, side, turns, min_score), min_score)
+            for box, keypoints, score in zip(
+                found.boxes, found.keypoints, found.scores, strict=True
+            ):
+                face = _landmarks(nets, photo, box, keypoints, float(score))
+                if face.presence >= min_presence and _is_new(face, faces):
+                    faces.append(face)
+            if faces:
+                break
+        if faces and smallest is None:
+            break
+    return sorted(faces, key=lambda face: -face.size)
+
+
+def detect_one(
+    image: Shaped[np.ndarray, "h w 3"],
+    index: int | None = None,
+    *,
+    networks: LandmarkNetworks | None = None,
+) -> DetectedFace:
+    """The only face in a photo, or the one numbered ``index`` from the largest (0).
+
+    Raises:
+        NoFaceError: there is none.
+        SeveralFacesError: there are several and ``index`` is not given.
+        ValueError: there is no face of that number, or the array is not a photo.
+    """
+    faces = detect_faces(image, networks=networks)
+    if not faces:
+        height, width = image.shape[:2]
+        raise NoFaceError(
+            f"no face was found in the photo of {width}x{height} px; one is needed, at least "
+            f"{SMALLEST_FACE:.0f} px wide and seen from the front or half from the side. "
+            "Landmarks made elsewhere can be given as a file instead"
+        )
+    listing = "; ".join(
+        f"{i}: {face.box[2] - face.box[0]:.0f}x{face.box[3] - face.box[1]:.0f} px at "
+        f"({face.box[0]:.0f}, {face.box[1]:.0f})"
+        for i, face in enumerate(faces)
+    )
+    if index is None:
+        if len(faces) > 1:
+            raise SeveralFacesError(
+                f"{len(faces)} faces were found where one is needed ({listing}); choose one by "
+                "its number with --face N (index=N)"
+            )
+        return faces[0]
+    if not 0 <= index < len(faces):
+        raise ValueError(f"face {index} is asked for, but the photo has {len(faces)} ({listing})")
+    return faces[index]
+
+
+def _tile_sides(longest: float, smallest: float) -> list[float]:
+    # Each scale sees faces down to _FACE_SHARE of its side.
+    sides = [float(longest)]
+    while sides[-1] * _FACE_SHARE > smallest:
+        sides.append(sides[-1] / 2)
+    return sides
+
+
+def _tile_starts(length: float, side: float) -> np.ndarray:
+    # Evenly spread; a photo shorter than the tile is centred in it.
+    if length <= side:
+        return np.array([(length - side) / 2])
+    count = int(np.ceil((length - side) / (side * _TILE_STEP))) + 1
+    return np.linspace(0, length - side, count)
+
+
+def _candidates(
+    nets: LandmarkNetworks, photo: PhotoPyramid, side: float, turns: int, min_score: float
+) -> Candidates:
+    # Detections in every tile of one scale, in the photo's pixels.
+    width, height = photo.size
+    scale = side / DETECTOR_SIZE
+    boxes, keypoints, scores = [], [], []
+    for top in _tile_starts(height, side):
+        for left in _tile_starts(width, side):
+            picture = np.rot90(photo.picture((left, top), side, DETECTOR_SIZE), turns)
+            found = jax.tree.map(np.asarray, _detect(nets.detector, picture))
+            good = found.scores >= min_score
+            corner = np.array([left, top])
+            points = np.concatenate([found.boxes[good].reshape(-1, 2, 2), found.keypoints[good]], 1)
+            points = corner + scale * _unturn(points, turns)
+            low, high = points[:, :2].min(axis=1), points[:, :2].max(axis=1)
+            boxes.append(np.concatenate([low, high], axis=1))
+            keypoints.append(points[:, 2:])
+            scores.append(found.scores[good])
+    return Candidates(np.concatenate(boxes), np.concatenate(keypoints), np.concatenate(scores))
+
+
+def _unturn(points: np.ndarray, turns: int) -> np.ndarray:
+    # Where points of a picture turned by np.rot90 (counter-clockwise) lie in the picture itself.
+    for _ in range(turns):
+        points = np.stack([DETECTOR_SIZE - points[..., 1], points[..., 0]], axis=-1)
+    return points
+
+
+def _landmarks(
+    nets: LandmarkNetworks,
+    photo: PhotoPyramid,
+    box: np.ndarray,
+    keypoints: np.ndarray,
+    score: float,
+) -> DetectedFace:
+    region = jax.tree.map(np.asarray, region_from_eyes(box, keypoints[0], keypoints[1]))
+    # Half the diagonal, and some room for the second region.
+    patch, corner, factor = photo.patch(region.centre, 0.8 * float(region.side), _PATCH_SIZE)
+    local = Region(
+        np.asarray(region.centre / factor - corner, np.float32),
+        np.asarray(region.side / factor, np.float32),
+        np.asarray(region.angle, np.float32),
+    )
+    points, presence = (np.asarray(x) for x in _refine(nets.mesh, patch, local))
+    landmarks = (points + np.append(corner, 0)) * factor
+    low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
+    return DetectedFace(np.concatenate([low, high]), score, landmarks, float(presence))
+
+
+def _is_new(face: DetectedFace, faces: list[DetectedFace]) -> bool:
+    return not faces or bool(np.all(overlap(face.box, np.array([f.box for f in faces])) < 0.3))
+
+
+@jax.jit
+def _detect(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> Candidates:
+    return detector(picture)
+
+
+@jax.jit
+def _refine(
+    mesh: LandmarkNet, patch: Float[np.ndarray, "p p 3"], region: Region
+) -> tuple[Float[np.ndarray, "468 3"], Float[np.ndarray, ""]]:
+    return refine_landmarks(mesh, patch, region)
