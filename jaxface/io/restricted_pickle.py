@@ -6,7 +6,6 @@ scipy.sparse, which old face models contain, resolve to passive records of their
 neither package is needed and no code of theirs runs.
 """
 
-import _codecs
 import io
 import pickle
 import zipfile
@@ -65,14 +64,13 @@ def _encode(text: str, encoding: str) -> bytes:
     """How a protocol-2 pickle written by Python 3 spells bytes."""
     if encoding not in ("latin1", "latin-1", "iso-8859-1"):
         raise UnsafePickleError(f"refused to encode text as {encoding!r}")
-    encoded = _codecs.latin_1_encode(text)
-    return encoded[0]
+    return text.encode("latin-1")
 
 
 def _array_names() -> dict[tuple[str, str], Any]:
     """Everything a pickle of NumPy arrays and plain containers may call."""
     scalar = np.float64(0).__reduce__()[0]
-    frombuffer = np.zeros(1).__reduce_ex__(5)[0]  # type: ignore[index]
+    frombuffer = np.zeros(1).__reduce_ex__(5)[0]
     names: dict[tuple[str, str], Any] = {
         ("numpy", "ndarray"): np.ndarray,
         ("numpy", "dtype"): np.dtype,

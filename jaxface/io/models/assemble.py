@@ -12,7 +12,6 @@ from jaxface.io.models.skin import generic_skin
 from jaxface.models.linear import LinearBasis, empty_basis
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 
-
 BLENDSHAPE_STD = 1.0 / 3.0
 """standard deviation given to blendshape weights, which come without statistics: the full
 expression, weight one, is then a 3-sigma event"""

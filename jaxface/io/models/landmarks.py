@@ -90,7 +90,7 @@ def read_landmarks68(
 
 
 def _vertex(index: int) -> _Point:
-    return (int(index),) * 3, (1.0, 0.0, 0.0)
+    return (int(index), int(index), int(index)), (1.0, 0.0, 0.0)
 
 
 def _read(path: Path, faces: np.ndarray) -> dict[int, _Point]:

@@ -42,7 +42,7 @@ def generic_skin(
     densities = [MELANIN_STD * np.tile(MELANIN, (count, 1))]
     densities.append(HAEMOGLOBIN_STD * np.tile(HAEMOGLOBIN, (count, 1)))
     if landmarks68 is not None:
-        eyes = np.linalg.norm(landmarks68[36] - landmarks68[45])
+        eyes = float(np.linalg.norm(landmarks68[36] - landmarks68[45]))
         lips = _window(vertices, landmarks68[48:60], 0.055 * eyes)
         brows = _window(vertices, landmarks68[17:27], 0.05 * eyes)
         jaw = np.concatenate([landmarks68[3:14], landmarks68[48:60], landmarks68[31:36]])
