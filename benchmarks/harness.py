@@ -206,7 +206,8 @@ def markdown(report: Mapping[str, Any], baseline: Mapping[str, Any] | None = Non
     packages = ", ".join(f"{name} {number}" for name, number in p["versions"].items())
     origin = (
         f"{p['date']}, commit {p['commit']}, {p['processor']}, {p['cores']} cores, "
-        f"load {p['load']}, {p['device_count']} x {p['device']}, {p['system']}, Python {p['python']}, {packages}"
+        f"load {p['load']}, {p['device_count']} x {p['device']}, {p['system']}, "
+        f"Python {p['python']}, {packages}"
     )
     note = ""
     if baseline and baseline["provenance"]["processor"] != p["processor"]:
