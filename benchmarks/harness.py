@@ -13,7 +13,6 @@ benchmarks/README.md), prints the table, compares and writes the results.
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -21,11 +20,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jax
+
+from jaxface.io.environment import environment
 
 RESULTS = Path(__file__).parent / "results"
 SCHEMA = 1
@@ -152,26 +152,11 @@ def timed(function: Callable[..., Any], *args: Any, **kwargs: Any) -> tuple[floa
 
 def provenance(packages: Iterable[str] = ()) -> dict[str, Any]:
     """Date, commit, processor, cores, devices and versions; nothing that names a machine."""
-    versions = {}
-    for package in packages:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
-        "python": platform.python_version(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "device": jax.devices()[0].device_kind,
-        "device_count": jax.device_count(),
-        "x64": bool(jax.config.read("jax_enable_x64")),
-        "versions": versions,
+        **environment(packages),
     }
 
 
@@ -206,8 +191,7 @@ def markdown(report: Mapping[str, Any], baseline: Mapping[str, Any] | None = Non
     packages = ", ".join(f"{name} {number}" for name, number in p["versions"].items())
     origin = (
         f"{p['date']}, commit {p['commit']}, {p['processor']}, {p['cores']} cores, "
-        f"load {p['load']}, {p['device_count']} x {p['device']}, {p['system']}, "
-        f"Python {p['python']}, {packages}"
+        f"load {p['load']}, {p['device_count']} x {p['device']}, {p['system']}, {packages}"
     )
     note = ""
     if baseline and baseline["provenance"]["processor"] != p["processor"]:
@@ -228,14 +212,3 @@ def _commit() -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            for line in lines:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
