@@ -282,7 +282,7 @@ def _add_camera(document: gltf.GLTF2, camera: GlbCamera) -> None:
     )
     document.cameras = [gltf.Camera(type="perspective", perspective=lens)]
     document.nodes.append(gltf.Node(camera=0, name="photo camera"))
-    document.scenes[0].nodes.append(1)
+    document.scenes = [gltf.Scene(nodes=[0, 1])]
 
 
 def _check(

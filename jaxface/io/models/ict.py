@@ -3,7 +3,7 @@
 Li et al., "Learning Formation of Physically-Based Face Attributes", CVPR 2020. Units centimetres,
 +y up, +z forward. The kit's light model has 26,719 vertices in twelve materials, 100 identity and
 53 expression shapes, each a mesh of its own; identity shapes stand one standard deviation from
-the neutral mesh. It has no albedo: a generic skin is put on.
+the neutral mesh. It has no albedo: a generic skin is put on, and teeth and eyes are painted.
 """
 
 import json
@@ -21,6 +21,7 @@ from jaxface.io.models.assemble import (
     require,
 )
 from jaxface.io.models.landmarks import vertex_points
+from jaxface.io.models.skin import generic_skin, paint_parts
 from jaxface.io.obj import read_obj, read_obj_vertices, triangles
 from jaxface.io.restricted_pickle import load_npz
 from jaxface.models.morphable import MorphableModel
@@ -190,25 +191,30 @@ def _build(
     for index in reversed(range(len(names))):  # a vertex on a border counts to the first part
         of_part = quads[materials == wanted[index]]
         region[np.unique(of_part[of_part >= 0])] = index
-    deltas = deltas[kept] * scale
+    mean, deltas = vertices[kept] * scale, deltas[kept] * scale
+    located = bool(np.all(landmarks >= 0))
+    albedo_mean, albedo, std = generic_skin(mean, mean[landmarks] if located else None)
+    albedo_mean, albedo = paint_parts(mean, region, tuple(names), albedo_mean, albedo)
     expressions = deltas.shape[-1] - identity_count
     return assemble(
         SourceModel(
             path=path,
             name="ict",
             licence=_LICENCE,
-            mean=vertices[kept] * scale,
+            mean=mean,
             faces=triangles(quads),
             identity=Modes(deltas[..., :identity_count], np.ones(identity_count)),
             expression=Modes(
                 deltas[..., identity_count:] * BLENDSHAPE_STD, np.full(expressions, BLENDSHAPE_STD)
             ),
             expression_names=expression_names,
+            albedo_mean=albedo_mean,
+            albedo=Modes(albedo, std),
             uv=_one_texture(uv, uv_polygons, materials)[kept_uv],
             uv_faces=triangles(uv_quads, is_quad),
             quads=quads,
             uv_quads=uv_quads,
-            landmarks68=vertex_points(landmarks) if np.all(landmarks >= 0) else None,
+            landmarks68=vertex_points(landmarks) if located else None,
             region=region,
             region_names=tuple(names),
         )
