@@ -8,7 +8,9 @@ import math
 
 import numpy as np
 
-from jaxface._types import Float, Shaped
+from jaxface._types import Float, Int, Shaped
+
+_SMALLEST_PHOTO = 16
 
 
 class PhotoPyramid:
@@ -22,31 +24,25 @@ class PhotoPyramid:
         """
         if photo.ndim != 3 or photo.shape[2] != 3:
             raise ValueError(f"photo has shape {photo.shape}; (height, width, 3) is needed")
-        if min(photo.shape[:2]) < 16:
+        if min(photo.shape[:2]) < _SMALLEST_PHOTO:
             raise ValueError(
-                f"photo is {photo.shape[1]}x{photo.shape[0]} px; at least 16x16 is needed"
+                f"photo is {photo.shape[1]}x{photo.shape[0]} px; at least "
+                f"{_SMALLEST_PHOTO}x{_SMALLEST_PHOTO} is needed"
             )
-        if photo.dtype == np.uint8:
-            values = photo.astype(np.float32) * np.float32(1 / 255)
-        elif np.issubdtype(photo.dtype, np.floating):
-            values = photo.astype(np.float32, copy=False)
-            if not np.isfinite(values).all():
+        if photo.dtype != np.uint8:
+            if not np.issubdtype(photo.dtype, np.floating):
+                raise ValueError(f"photo is {photo.dtype}; uint8 or floats in [0, 1] are needed")
+            if not np.isfinite(photo).all():
                 raise ValueError("photo holds NaN or infinite values")
-        else:
-            raise ValueError(f"photo is {photo.dtype}; uint8 or floats in [0, 1] are needed")
-        self._levels = [values]
+        self._photo = photo
+        # Halves have the channels first: NumPy is slow on an inner axis of three.
+        self._halves: list[Float[np.ndarray, "3 _ _"]] = []
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height, px."""
-        height, width = self._levels[0].shape[:2]
+        height, width = self._photo.shape[:2]
         return width, height
-
-    def level(self, index: int) -> Float[np.ndarray, "h w 3"]:
-        """The photo divided by ``2**index``; it is never made smaller than 2 px."""
-        while len(self._levels) <= index:
-            self._levels.append(_halve(self._levels[-1]))
-        return self._levels[index]
 
     def picture(
         self, corner: tuple[float, float], side: float, size: int
@@ -56,23 +52,25 @@ class PhotoPyramid:
         Antialiased: halved until less than twice too large, then a triangle filter.
         """
         index = max(0, math.floor(math.log2(side / size)))
-        image = self.level(index)
-        scale = side / 2**index / size
-        x, y = (c / 2**index for c in corner)
-        rows = _window_weights(image.shape[0], y, scale, size)
-        columns = _window_weights(image.shape[1], x, scale, size)
-        (top, row_weights), (left, column_weights) = rows, columns
-        part = image[
-            top : top + row_weights.shape[1], left : left + column_weights.shape[1]
-        ]
-        shrunk = np.tensordot(row_weights, part, 1)
-        return np.ascontiguousarray(
-            np.tensordot(column_weights, shrunk, (1, 1)).transpose(1, 0, 2), np.float32
+        factor = 2**index
+        height, width = self._level_shape(index)
+        scale = side / factor / size
+        rows, row_weights = _taps(height, corner[1] / factor, scale, size)
+        columns, column_weights = _taps(width, corner[0] / factor, scale, size)
+        top, left = rows.min(), columns.min()
+        part = self._part(index, slice(top, rows.max() + 1), slice(left, columns.max() + 1))
+        shrunk = sum(
+            part[:, rows[:, t] - top] * row_weights[:, t, None] for t in range(rows.shape[1])
         )
+        result = sum(
+            shrunk[:, :, columns[:, t] - left] * column_weights[:, t]
+            for t in range(columns.shape[1])
+        )
+        return np.ascontiguousarray(np.moveaxis(result, 0, -1))
 
     def patch(
         self, centre: tuple[float, float], reach: float, size: int
-    ) -> tuple[Float[np.ndarray, "size size 3"], Float[np.ndarray, "2"], int]:
+    ) -> tuple[Float[np.ndarray, "3 size size"], Float[np.ndarray, "2"], int]:
         """Pixels around ``centre``, not resampled, from the finest level where ``reach`` fits.
 
         Beyond the border the border pixel goes on.
@@ -83,38 +81,69 @@ class PhotoPyramid:
             size: side of the patch.
 
         Returns:
-            The patch, its corner (x, y) in the pixels of the level, and the factor by which the
+            The patch (channels first), its corner (x, y) in the pixels of the level, and the factor by which the
             level is smaller: a patch point p is the photo's ``factor * (corner + p)``.
         """
         index = max(0, math.ceil(math.log2(2 * (reach + 1) / size)))
-        image = self.level(index)
         factor = 2**index
+        height, width = self._level_shape(index)
         corner = np.round(np.asarray(centre) / factor - size / 2)
-        steps = np.arange(size)
-        rows = np.clip(int(corner[1]) + steps, 0, image.shape[0] - 1)
-        columns = np.clip(int(corner[0]) + steps, 0, image.shape[1] - 1)
-        return image[rows[:, None], columns], corner, factor
+        top, bottom, above, below = _cut(int(corner[1]), size, height)
+        left, right, before, after = _cut(int(corner[0]), size, width)
+        part = self._part(index, slice(top, bottom), slice(left, right))
+        patch = np.pad(part, ((0, 0), (above, below), (before, after)), mode="edge")
+        return patch, corner, factor
+
+    def _level_shape(self, index: int) -> tuple[int, int]:
+        if index == 0:
+            return self._photo.shape[0], self._photo.shape[1]
+        while len(self._halves) < index:
+            finer = (
+                self._halves[-1] if self._halves else np.moveaxis(self._photo, -1, 0)
+            )
+            self._halves.append(_halve(finer))
+        return self._halves[index - 1].shape[1], self._halves[index - 1].shape[2]
+
+    def _part(self, index: int, rows: slice, columns: slice) -> Float[np.ndarray, "3 _ _"]:
+        if index:
+            return self._halves[index - 1][:, rows, columns]
+        scale = np.float32(1 / 255 if self._photo.dtype == np.uint8 else 1)
+        part = self._photo[rows, columns]
+        return np.stack([np.multiply(part[..., c], scale, dtype=np.float32) for c in range(3)])
 
 
-def _halve(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h2 w2 c"]:
-    height, width = image.shape[:2]
+def _halve(image: Shaped[np.ndarray, "3 h w"]) -> Float[np.ndarray, "3 h2 w2"]:
+    # Means of 2x2 blocks; the last row or column of an odd size is repeated.
+    _, height, width = image.shape
     if height % 2 or width % 2:
-        image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    rows = image[0::2] + image[1::2]
-    return (rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25)
+        image = np.pad(image, ((0, 0), (0, height % 2), (0, width % 2)), mode="edge")
+    wide = np.uint16 if image.dtype == np.uint8 else np.float32
+    total = np.add(image[:, 0::2, 0::2], image[:, 0::2, 1::2], dtype=wide, casting="same_kind")
+    total += image[:, 1::2, 0::2]
+    total += image[:, 1::2, 1::2]
+    return total * np.float32(0.25 / 255 if wide is np.uint16 else 0.25)
 
 
-def _window_weights(
+def _taps(
     source: int, start: float, scale: float, size: int
-) -> tuple[int, Float[np.ndarray, "size part"]]:
-    # One axis of a resize: the first source pixel that is used, and the weights from there on.
+) -> tuple[Int[np.ndarray, "size taps"], Float[np.ndarray, "size taps"]]:
+    # One axis of a resize by a triangle filter: the source pixels under each target pixel, and
+    # their weights (all zero for a target pixel outside the source).
     centres = start + (np.arange(size) + 0.5) * scale
     support = max(scale, 1.0)
-    first = int(np.clip(math.floor(centres[0] - support), 0, source - 1))
-    last = int(np.clip(math.ceil(centres[-1] + support), first + 1, source))
-    clamped = np.clip(centres, 0.5, source - 0.5)
-    distance = np.abs(np.arange(first, last) + 0.5 - clamped[:, None])
-    weights = np.maximum(1 - distance / support, 0)
+    first = np.floor(centres - support).astype(int)
+    taps = first[:, None] + np.arange(math.ceil(2 * support) + 1)
+    distance = np.abs(taps + 0.5 - np.clip(centres, 0.5, source - 0.5)[:, None])
+    weights = np.maximum(1 - distance / support, 0) * ((taps >= 0) & (taps < source))
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(float).tiny)
     inside = (centres > 0) & (centres < source)
-    return first, (weights * inside[:, None]).astype(np.float32)
+    return np.clip(taps, 0, source - 1), (weights * inside[:, None]).astype(np.float32)
+
+
+def _cut(start: int, size: int, length: int) -> tuple[int, int, int, int]:
+    # The part [start, start + size) of an axis: what exists (one pixel at least), and how many
+    # pixels it lacks before and after.
+    first = min(max(start, 0), length - 1)
+    last = max(min(start + size, length), first + 1)
+    before = min(max(-start, 0), size - (last - first))
+    return first, last, before, size - before - (last - first)

@@ -131,14 +131,16 @@ def landmarks_in_region(
 def refine_landmarks(
     net: LandmarkNet, image: Float[Array, "h w 3"], region: Region, passes: int = 2
 ) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
-    """Points and presence after ``passes`` rounds, each in the region of the round before's points."""
+    """Points and presence after ``passes`` rounds, each in the region that the last one's points give.
 
-    def one_pass(region, _):
-        landmarks, presence = landmarks_in_region(net, image, region)
-        return region_from_landmarks(landmarks), (landmarks, presence)
-
-    _, (landmarks, presence) = jax.lax.scan(one_pass, region, None, length=passes)
-    return landmarks[-1], presence[-1]
+    Raises:
+        ValueError: ``passes`` is less than 1.
+    """
+    if passes < 1:
+        raise ValueError(f"passes is {passes}; at least one is needed")
+    for _ in range(passes - 1):
+        region = region_from_landmarks(landmarks_in_region(net, image, region)[0])
+    return landmarks_in_region(net, image, region)
 
 
 def inter_ocular_distance(landmarks: Float[Array, "468 3"]) -> Float[Array, ""]:

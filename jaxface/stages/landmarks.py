@@ -5,9 +5,12 @@ from importlib import resources
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Float, Shaped
+from jaxface._types import Array, Float, Shaped
+from jaxface.imaging.pyramid import halve
+from jaxface.imaging.resample import affine_crop
 from jaxface.imaging.windows import PhotoPyramid
 from jaxface.models.face_detector import (
     DETECTOR_SIZE,
@@ -20,9 +23,10 @@ from jaxface.models.face_detector import (
 from jaxface.models.landmarks_net import (
     LandmarkNet,
     Region,
+    landmarks_in_region,
     read_landmark_net,
-    refine_landmarks,
     region_from_eyes,
+    region_from_landmarks,
 )
 
 SMALLEST_FACE = 40.0
@@ -34,7 +38,17 @@ _FACE_SHARE = 0.16
 _TILE_STEP = 1 - 2 * _FACE_SHARE
 # Turned photos are tried on the whole and on tiles down to a quarter, where they are few.
 _TURNED_SCALES = 3
+# The pixels that a face is read from: they hold its region at any angle, and room to move it.
 _PATCH_SIZE = 640
+_REACH = 0.95
+# Looks at a face at most, and the move of its region (share of the side) that ends them.
+_MAX_LOOKS = 5
+_STILL = 0.02
+# The second opinion on a face: side of the picture over that of the landmarks' region, how far
+# from its middle (px) a detection counts, and the score below which other turns are tried.
+_LEVEL_MARGIN = 4 / 3
+_CENTRAL = 20.0
+_SURE_SCORE = 0.8
 
 
 class NoFaceError(ValueError):
@@ -51,7 +65,7 @@ class DetectedFace(eqx.Module):
     box: Float[np.ndarray, "4"]
     """left, top, right, bottom of the landmarks, px"""
     score: float
-    """the detector's probability"""
+    """the detector's probability for the face seen level"""
     landmarks: Float[np.ndarray, "468 3"]
     """MediaPipe face mesh: x, y (px) and relative depth (px, larger is farther)"""
     presence: float
@@ -110,15 +124,15 @@ def detect_faces(
     for depth, side in enumerate(_tile_sides(max(photo.size), smallest or SMALLEST_FACE)):
         for turns in (0, 1, 3, 2) if depth < _TURNED_SCALES else (0,):
             found = suppress(_candidates(nets, photo, side, turns, min_score), min_score)
-            for box, keypoints, score in zip(
-                found.boxes, found.keypoints, found.scores, strict=True
-            ):
-                face = _landmarks(nets, photo, box, keypoints, float(score))
-                if face.presence >= min_presence and _is_new(face, faces):
+            for box, keypoints in zip(found.boxes, found.keypoints, strict=True):
+                face = _landmarks(nets, photo, box, keypoints)
+                sure = face.score >= min_score and face.presence >= min_presence
+                if sure and _is_new(face, faces):
                     faces.append(face)
             if faces:
                 break
-        if faces and smallest is None:
+        # Faces near the limit of this scale may have neighbours just beyond it.
+        if smallest is None and any(face.size > _FACE_SHARE * side for face in faces):
             break
     return sorted(faces, key=lambda face: -face.size)
 
@@ -207,24 +221,52 @@ def _unturn(points: np.ndarray, turns: int) -> np.ndarray:
 
 
 def _landmarks(
-    nets: LandmarkNetworks,
-    photo: PhotoPyramid,
-    box: np.ndarray,
-    keypoints: np.ndarray,
-    score: float,
+    nets: LandmarkNetworks, photo: PhotoPyramid, box: np.ndarray, keypoints: np.ndarray
 ) -> DetectedFace:
     region = jax.tree.map(np.asarray, region_from_eyes(box, keypoints[0], keypoints[1]))
-    # Half the diagonal, and some room for the second region.
-    patch, corner, factor = photo.patch(region.centre, 0.8 * float(region.side), _PATCH_SIZE)
+    patch, corner, factor = photo.patch(region.centre, _REACH * float(region.side), _PATCH_SIZE)
     local = Region(
         np.asarray(region.centre / factor - corner, np.float32),
         np.asarray(region.side / factor, np.float32),
         np.asarray(region.angle, np.float32),
     )
-    points, presence = (np.asarray(x) for x in _refine(nets.mesh, patch, local))
-    landmarks = (points + np.append(corner, 0)) * factor
+    points, presence, local = _settle(nets.mesh, patch, local)
+    # The mesh is sure of itself upside down and on blobs. A face seen level convinces the
+    # detector, and more so than any other turn of it does.
+    level = _level_picture(patch, local)
+    scores = [_central_score(nets.detector, level)]
+    if scores[0] < _SURE_SCORE:
+        scores += [_central_score(nets.detector, np.rot90(level, turns)) for turns in (1, 2, 3)]
+    turns = int(np.argmax(scores))
+    if turns:
+        turned = Region(local.centre, local.side, local.angle + np.float32(turns * np.pi / 2))
+        points, presence, _ = _settle(nets.mesh, patch, turned)
+    landmarks = (np.asarray(points) + np.append(corner, 0)) * factor
     low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
-    return DetectedFace(np.concatenate([low, high]), score, landmarks, float(presence))
+    return DetectedFace(np.concatenate([low, high]), scores[turns], landmarks, float(presence))
+
+
+def _settle(
+    mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
+) -> tuple[Array, Array, Region]:
+    # Look until the region that the points give is the one they were found in. A detection's
+    # region is rough, so the first look never counts.
+    landmarks, presence, region = _look(mesh, patch, region)
+    for _ in range(_MAX_LOOKS - 1):
+        landmarks, presence, moved = _look(mesh, patch, region)
+        shift = np.max(np.abs(np.asarray(moved.centre) - np.asarray(region.centre)))
+        region, still = moved, max(shift, abs(moved.side - region.side)) < _STILL * moved.side
+        if still:
+            break
+    return landmarks, presence, region
+
+
+def _central_score(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> float:
+    # The best score among the boxes that are about the middle.
+    found = jax.tree.map(np.asarray, _detect(detector, picture))
+    away = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2 - DETECTOR_SIZE / 2
+    central = np.max(np.abs(away), axis=1) < _CENTRAL
+    return float(np.max(found.scores * central))
 
 
 def _is_new(face: DetectedFace, faces: list[DetectedFace]) -> bool:
@@ -237,7 +279,16 @@ def _detect(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> 
 
 
 @jax.jit
-def _refine(
-    mesh: LandmarkNet, patch: Float[np.ndarray, "p p 3"], region: Region
-) -> tuple[Float[np.ndarray, "468 3"], Float[np.ndarray, ""]]:
-    return refine_landmarks(mesh, patch, region)
+def _level_picture(patch: Float[np.ndarray, "3 p p"], region: Region) -> Array:
+    wider = Region(region.centre, region.side * _LEVEL_MARGIN, region.angle)
+    size = 2 * DETECTOR_SIZE
+    return halve(affine_crop(jnp.moveaxis(patch, 0, -1), wider.transform(size), size, size))
+
+
+@jax.jit
+def _look(
+    mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
+) -> tuple[Float[np.ndarray, "468 3"], Float[np.ndarray, ""], Region]:
+    # Points, presence, and the region to look at next.
+    landmarks, presence = landmarks_in_region(mesh, jnp.moveaxis(patch, 0, -1), region)
+    return landmarks, presence, region_from_landmarks(landmarks)
