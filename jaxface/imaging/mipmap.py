@@ -44,16 +44,20 @@ class Mipmap(eqx.Module):
         y = jnp.clip(points[:, 1] * shrink - 0.5, 0.0, height - 1.0)
         left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, jnp.maximum(width - 2, 0))
         top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, jnp.maximum(height - 2, 0))
-        u, v = (x - left)[:, None], (y - top)[:, None]
+        u, v = x - left, y - top
         right, down = jnp.minimum(width - 1, 1), jnp.minimum(height - 1, 1) * width
         corner = start + top * width + left
 
-        def take(index: Array) -> Array:
-            return self.pixels.at[index].get(mode="promise_in_bounds")
+        def channel(k: int) -> Array:
+            def take(index: Array) -> Array:
+                return self.pixels.at[index, k].get(mode="promise_in_bounds")
 
-        upper = take(corner) * (1 - u) + take(corner + right) * u
-        lower = take(corner + down) * (1 - u) + take(corner + down + right) * u
-        return upper * (1 - v) + lower * v
+            upper = take(corner) * (1 - u) + take(corner + right) * u
+            lower = take(corner + down) * (1 - u) + take(corner + down + right) * u
+            return upper * (1 - v) + lower * v
+
+        # One vector of points a channel: loops over a short last axis are slow on a CPU.
+        return jnp.stack([channel(k) for k in range(self.pixels.shape[1])], axis=-1)
 
     def trilinear(
         self, points: Float[Array, "n 2"], level: Float[Array, "n"]
@@ -64,19 +68,22 @@ class Mipmap(eqx.Module):
         than a pixel) the finest level is used. Where no point asks for more, only that is read.
         """
 
-        def fine() -> Array:
-            return self.bilinear(points)
+        def fine() -> tuple[Array, ...]:
+            return self._channels(self.bilinear(points))
 
-        def blended() -> Array:
+        def blended() -> tuple[Array, ...]:
             clamped = jnp.clip(level, 0.0, self.coarsest)
             low = jnp.minimum(jnp.floor(clamped).astype(jnp.int32), max(self.coarsest - 1, 0))
             part = (clamped - low)[:, None]
-            high = jnp.minimum(low + 1, self.coarsest)
-            return self.bilinear(points, low) * (1 - part) + self.bilinear(points, high) * part
+            below, above = self.bilinear(points, low), self.bilinear(points, low + 1)
+            return self._channels(below * (1 - part) + above * part)
 
         if self.coarsest == 0:
-            return fine()
-        return jax.lax.cond(jnp.any(level > 0), blended, fine)
+            return self.bilinear(points)
+        return jnp.stack(jax.lax.cond(jnp.any(level > 0), blended, fine), axis=-1)
+
+    def _channels(self, samples: Array) -> tuple[Array, ...]:
+        return tuple(samples[:, k] for k in range(self.pixels.shape[1]))
 
 
 def mipmap(image: Float[Array, "h w c"], levels: int = 6) -> Mipmap:

@@ -18,12 +18,10 @@ from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import face_areas_normals, vertex_normals
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.masks import feather, smoothstep
-from jaxface.imaging.mipmap import Mipmap, mipmap
-from jaxface.render.rasterize import rasterize
-from jaxface.render.shading import irradiance
-
-# A surface seen steeper than this (tangent of the angle to the view) counts as a depth jump.
-_STEEPEST = 6.0
+from jaxface.imaging.mipmap import mipmap
+from jaxface.imaging.push_pull import push_pull
+from jaxface.render.depth_buffer import DepthBuffer, depth_buffer
+from jaxface.render.shading import irradiance, sh_basis
 
 
 class PartialAlbedo(eqx.Module):
@@ -54,7 +52,7 @@ def unwrap(
     grazing: tuple[float, float] = (75.0, 50.0),
     feather_width: float = 3.0,
     shading_floor: float = 0.1,
-    depth_size: int = 1024,
+    depth_size: int = 512,
     tile: int = 128,
 ) -> PartialAlbedo:
     """Albedo ``photo / (H(n) L)`` of every texel the photo shows, and how far to trust it.
@@ -91,70 +89,68 @@ def unwrap(
     """
     _check(photo, mask, faces, layout, grazing, shading_floor)
     height, width = photo.shape[:2]
-    scale = min(1.0, depth_size / max(height, width))
-    depth, reliable = _visibility(vertices, faces, camera, height, width, scale, feather_width)
-    padded = jnp.pad(mask > 0, 1)
-    alpha = feather(padded, feather_width)[1:-1, 1:-1] * mask * reliable
+    buffer = depth_buffer(vertices, faces, camera, height, width, depth_size)
+    alpha = _confidence(mask, buffer, feather_width).astype(photo.dtype)
     pyramid = mipmap(jnp.concatenate([photo * alpha[..., None], alpha[..., None]], axis=-1))
 
     normals = vertex_normals(vertices, faces)
-    table, alive, shade = _triangles(vertices, normals, faces, camera, light, layout, photo)
-    floor = jax.lax.stop_gradient(shading_floor * shade)
+    front = jnp.sum(normals * vertices, axis=-1, keepdims=True) < 0
+    lit = jnp.sum(jnp.where(front, irradiance(normals, light), 0.0)) / jnp.maximum(
+        3 * jnp.sum(front), 1
+    )
+    floor = jax.lax.stop_gradient(jnp.maximum(shading_floor * lit, 1e-6))
     cos_zero, cos_one = (math.cos(math.radians(angle)) for angle in grazing)
+    table, alive = _triangles(vertices, normals, faces, camera, layout, (width, height))
 
-    def colour(triangle: Array, barycentric: Array) -> tuple[Array, Array]:
-        row = table[triangle]
-        b, c = barycentric[:, :1], barycentric[:, 1:]
-        point = row[:, 0:3] + row[:, 3:6] * b + row[:, 6:9] * c
-        normal = safe_normalize(row[:, 9:12] + row[:, 12:15] * b + row[:, 15:18] * c)
+    # Every quantity of a tile is one vector of texels per component: loops over a short last
+    # axis are several times slower on a CPU, and the stacks below cost nothing once compiled.
+    def texels(triangle: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+        def column(k: int) -> Array:
+            return table.at[triangle, k].get(mode="promise_in_bounds")
+
+        def across(k: int) -> Array:
+            corner, first, second = (
+                jnp.stack([column(k + i) for i in (0, 1, 2)], axis=-1) for k in (k, k + 3, k + 6)
+            )
+            return corner + first * b[:, None] + second * c[:, None]
+
+        point, normal = across(0), across(9)
+        normal = normal * jax.lax.rsqrt(jnp.maximum(_dot(normal, normal), 1e-12))[:, None]
         screen = camera.project(point)
-        seen = _unoccluded(point, screen, row[:, 18:21], depth, camera, scale)
-        cosine = -jnp.sum(normal * safe_normalize(point), axis=-1)
-        sample = pyramid.trilinear(screen[:, :2], jax.lax.stop_gradient(row[:, 21]))
-        shading = irradiance(normal, light)
-        lit = smoothstep(jnp.min(shading, axis=-1), floor, 2 * floor)
+        face_normal = jnp.stack([column(18), column(19), column(20)], axis=-1)
+        seen = buffer.unoccluded(point, face_normal)
+        cosine = -_dot(normal, point) * jax.lax.rsqrt(_dot(point, point))
+        sample = pyramid.trilinear(screen[:, :2], jax.lax.stop_gradient(column(21)))
         cover = sample[:, 3]
-        weight = smoothstep(cosine, cos_zero, cos_one) * cover * lit * seen
-        linear = sample[:, :3] / jnp.maximum(cover, 1e-4)[:, None]
-        albedo = jnp.maximum(linear, 0.0) / jnp.maximum(shading, floor)
-        albedo = jnp.where(weight[:, None] > 0, albedo, 0.0)
-        return jnp.concatenate([albedo, weight[:, None]], axis=-1), seen & (cover > 0)
+        basis = sh_basis(normal)
+        shading = [sum(basis[:, k] * light[k, rgb] for k in range(9)) for rgb in range(3)]
+        darkest = jnp.minimum(jnp.minimum(shading[0], shading[1]), shading[2])
+        weight = smoothstep(cosine, cos_zero, cos_one) * cover * seen
+        weight = weight * smoothstep(darkest, floor, 2 * floor)
+        inverse = 1.0 / jnp.maximum(cover, 1e-4)
+        albedo = [
+            jnp.maximum(sample[:, rgb] * inverse, 0.0) / jnp.maximum(shading[rgb], floor)
+            for rgb in range(3)
+        ]
+        return jnp.stack(albedo, axis=-1), weight, seen & (cover > 0)
 
-    values, seen = _by_tiles(colour, layout, alive, min(tile, layout.resolution), photo.dtype)
-    return PartialAlbedo(values[..., :3], values[..., 3], seen & layout.inside)
+    return _by_tiles(texels, layout, alive, min(tile, layout.resolution), photo.dtype)
 
 
-def _visibility(
-    vertices: Array,
-    faces: Array,
-    camera: Camera,
-    height: int,
-    width: int,
-    scale: float,
-    feather_width: float,
-) -> tuple[Array, Array]:
-    """Depth buffer (mm), and how far each pixel of the photo is from a depth jump (0 to 1)."""
-    shape = max(1, math.ceil(height * scale)), max(1, math.ceil(width * scale))
-    screen = jax.lax.stop_gradient(camera.scaled(scale).project(vertices))
-    depth = jax.lax.stop_gradient(rasterize(screen, faces, *shape).depth)
-    jump = jnp.zeros(shape, bool)
-    for axis in (0, 1):
-        near, far = (jnp.take(depth, jnp.arange(s, e), axis) for s, e in _pairs(shape[axis]))
-        step = jnp.abs(near - far) * camera.focal * scale
-        steep = step > _STEEPEST * jnp.minimum(near, far)
-        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        before[axis], after[axis] = (0, 1), (1, 0)
-        jump = jump | jnp.pad(steep, before) | jnp.pad(steep, after)
-    reliable = feather(~jump, max(1.0, feather_width * scale))
-    if shape != (height, width):
-        x, y = ((jnp.arange(n) + 0.5) * scale for n in (width, height))
+def _dot(a: Array, b: Array) -> Array:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
+def _confidence(mask: Array, buffer: DepthBuffer, feather_width: float) -> Array:
+    """How far each pixel shows one surface inside the mask: 0 at its edge and contours, then 1."""
+    height, width = mask.shape
+    inside = feather(jnp.pad(mask > 0, 1), feather_width)[1:-1, 1:-1]
+    clear = feather(~buffer.contours(), max(1.0, feather_width * buffer.scale))
+    if clear.shape != mask.shape:
+        x, y = ((jnp.arange(n) + 0.5) * buffer.scale for n in (width, height))
         points = jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        reliable = mipmap(reliable[..., None], 1).bilinear(points).reshape(height, width)
-    return depth, reliable
-
-
-def _pairs(size: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    return (0, size - 1), (1, size)
+        clear = mipmap(clear[..., None], 1).bilinear(points).reshape(height, width)
+    return inside * mask * clear
 
 
 def _triangles(
@@ -162,102 +158,119 @@ def _triangles(
     normals: Array,
     faces: Array,
     camera: Camera,
-    light: Array,
     layout: UVLayout,
-    photo: Array,
-) -> tuple[Array, Array, Array]:
-    """What a texel needs of its triangle, which triangles may be seen, and the mean shading.
+    size: tuple[int, int],
+) -> tuple[Array, Array]:
+    """What a texel needs of its triangle, and which triangles the photo may show at all.
 
-    A row holds a corner and two edges of the positions (9), of the normals (9), the face
-    normal (3) and the mipmap level (1): one gather a texel instead of seven.
+    A row holds a corner and two edges of the positions (9), the same of the normals (9), the
+    face normal (3) and the mipmap level (1): one look-up a texel instead of seven.
     """
     corner = vertices[faces]
-    screen = camera.project(corner.reshape(-1, 3)).reshape(-1, 3, 3)
+    screen = camera.project(corner)
     flat = face_areas_normals(vertices, faces)
     facing = jnp.sum(flat * corner[:, 0], axis=-1) < 0
-    # Smooth shading needs smooth normals, so a triangle in profile may have corners facing away.
-    size = jnp.array([photo.shape[1], photo.shape[0]], screen.dtype)
-    off = jnp.all(screen[..., :2] < 0, axis=1) | jnp.all(screen[..., :2] > size, axis=1)
-    alive = facing & ~jnp.any(off, axis=-1) & jnp.all(screen[..., 2] > 0, axis=-1)
+    beyond = jnp.all(screen[..., :2] < 0, axis=1)
+    beyond = beyond | jnp.all(screen[..., :2] > jnp.array(size, screen.dtype), axis=1)
+    alive = facing & ~jnp.any(beyond, axis=-1) & jnp.all(screen[..., 2] > 0, axis=-1)
     b, c = screen[:, 1, :2] - screen[:, 0, :2], screen[:, 2, :2] - screen[:, 0, :2]
     pixels = 0.5 * jnp.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    ratio = jnp.maximum(pixels, 1e-12) / jnp.maximum(layout.area, 1e-12)
-    level = jax.lax.stop_gradient(0.5 * jnp.log2(ratio))
+    level = 0.5 * jnp.log2(jnp.maximum(pixels, 1e-12) / jnp.maximum(layout.area, 1e-12))
     parts = []
     for values in (corner, normals[faces]):
         parts += [values[:, 0], values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]]
-    table = jnp.concatenate([*parts, safe_normalize(flat), level[:, None]], axis=-1)
-    front = jnp.sum(normals * vertices, axis=-1, keepdims=True) < 0
-    shading = jnp.where(front, irradiance(normals, light), 0.0)
-    mean = jnp.sum(shading) / jnp.maximum(3 * jnp.sum(front), 1)
-    return table, alive, jnp.maximum(mean, 1e-6)
+    return jnp.concatenate([*parts, safe_normalize(flat), level[:, None]], axis=-1), alive
 
 
-def _unoccluded(
-    point: Array, screen: Array, face_normal: Array, depth: Array, camera: Camera, scale: float
-) -> Array:
-    """Whether nothing in the depth buffer lies in front of the surface points.
-
-    The triangle's plane is extended to the centre of the buffer's pixel, so its slope cannot
-    be mistaken for an occluder; what is left, the curvature within a pixel, is within the tolerance of
-    one pixel's size on the surface.
-    """
-    height, width = depth.shape
-    x, y = screen[:, 0] * scale, screen[:, 1] * scale
-    column = jnp.clip(jnp.floor(x), 0, width - 1)
-    row = jnp.clip(jnp.floor(y), 0, height - 1)
-    focal = camera.focal * scale
-    ray = jnp.stack(
-        [
-            (column + 0.5 - camera.principal[0] * scale) / focal,
-            -(row + 0.5 - camera.principal[1] * scale) / focal,
-            -jnp.ones_like(column),
-        ],
-        axis=-1,
-    )
-    slope = jnp.minimum(jnp.sum(face_normal * ray, axis=-1), -1e-3)
-    plane = jnp.sum(face_normal * point, axis=-1) / slope
-    pixel = screen[:, 2] / focal
-    tangent = jnp.minimum(-1.0 / slope, _STEEPEST)
-    # At a glancing angle the plane may run away within a pixel; the point itself bounds it.
-    expected = jnp.clip(plane, screen[:, 2] - _STEEPEST * pixel, screen[:, 2] + _STEEPEST * pixel)
-    index = row.astype(jnp.int32) * width + column.astype(jnp.int32)
-    nearest = depth.reshape(-1).at[index].get(mode="promise_in_bounds")
-    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-    return jax.lax.stop_gradient(inside & (nearest > expected - 0.5 * pixel * (1.0 + tangent)))
-
-
-def _by_tiles(colour, layout: UVLayout, alive: Array, tile: int, dtype) -> tuple[Array, Array]:
-    """Evaluate ``colour`` on square tiles of the texture, skipping those with nothing to see."""
+def _by_tiles(texels, layout: UVLayout, alive: Array, tile: int, dtype) -> PartialAlbedo:
+    """Evaluate ``texels`` on square tiles of the texture, skipping those with nothing to see."""
     size = layout.resolution
     count = -(-size // tile)
     extra = count * tile - size
     triangle = jnp.pad(layout.triangle, ((0, extra), (0, extra)), constant_values=-1)
     barycentric = jnp.pad(layout.barycentric, ((0, extra), (0, extra), (0, 0)))
+    inside = jnp.pad(layout.inside, ((0, extra), (0, extra)))
 
-    @jax.checkpoint
-    def one(index: Array) -> tuple[Array, Array]:
-        row, column = (index // count) * tile, (index % count) * tile
-        ids = jax.lax.dynamic_slice(triangle, (row, column), (tile, tile)).reshape(-1)
-        weights = jax.lax.dynamic_slice(barycentric, (row, column, 0), (tile, tile, 2))
+    def one(row: Array, column: Array) -> tuple[Array, Array, Array]:
+        at, square = (row * tile, column * tile), (tile, tile)
+        ids = jax.lax.dynamic_slice(triangle, at, square).reshape(-1)
+        weights = jax.lax.dynamic_slice(barycentric, (*at, 0), (*square, 2)).reshape(-1, 2)
+        chart = jax.lax.dynamic_slice(inside, at, square).reshape(-1)
         live = (ids >= 0) & alive[jnp.maximum(ids, 0)]
 
-        def evaluate() -> tuple[Array, Array]:
-            values, seen = colour(jnp.maximum(ids, 0), weights.reshape(-1, 2).astype(dtype))
-            return jnp.where(live[:, None], values, 0.0), seen & live
+        def evaluate() -> tuple[Array, Array, Array]:
+            b, c = weights[:, 0].astype(dtype), weights[:, 1].astype(dtype)
+            albedo, weight, seen = texels(jnp.maximum(ids, 0), b, c)
+            weight = jnp.where(live, weight, 0.0).astype(dtype)
+            albedo = jnp.where(weight[:, None] > 0, albedo, 0.0).astype(dtype)
+            return albedo, weight, seen & live & chart
 
-        def skip() -> tuple[Array, Array]:
-            return jnp.zeros((tile * tile, 4), dtype), jnp.zeros(tile * tile, bool)
+        def skip() -> tuple[Array, Array, Array]:
+            n = tile * tile
+            return jnp.zeros((n, 3), dtype), jnp.zeros(n, dtype), jnp.zeros(n, bool)
 
         return jax.lax.cond(jnp.any(live), evaluate, skip)
 
-    values, seen = jax.lax.map(one, jnp.arange(count * count))
+    # Rows of tiles stack up to the texture as they are; only within one are texels reordered.
+    @jax.checkpoint
+    def strip(row: Array) -> tuple[Array, ...]:
+        tiles = jax.lax.map(lambda column: one(row, column), jnp.arange(count))
+        squares = (x.reshape(count, tile, tile, *x.shape[2:]) for x in tiles)
+        return tuple(
+            jnp.swapaxes(x, 0, 1).reshape(tile, count * tile, *x.shape[3:]) for x in squares
+        )
 
-    def assemble(tiles: Array) -> Array:
-        grid = tiles.reshape(count, count, tile, tile, -1)
-        return jnp.swapaxes(grid, 1, 2).reshape(count * tile, count * tile, -1)[:size, :size]
+    maps = jax.lax.map(strip, jnp.arange(count))
+    return PartialAlbedo(
+        *(x.reshape(count * tile, count * tile, *x.shape[3:])[:size, :size] for x in maps)
+    )
 
-    return assemble(values), assemble(seen)[..., 0]
+
+@partial(jax.jit, static_argnames=("cells",))
+def complete_preview(
+    partial_albedo: PartialAlbedo,
+    low_frequency: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    layout: UVLayout,
+    *,
+    cells: int = 64,
+) -> Float[Array, "r r 3"]:
+    """A whole texture to look at: the partial albedo over the model's low-frequency one.
+
+    Where the photo shows nothing, the low-frequency albedo of the fit stands in, multiplied by
+    a smooth gain that makes the two agree where they meet. It holds no detail there: the
+    synthesis of Saito 2017 (section 5) is what replaces it.
+
+    Args:
+        partial_albedo: from ``unwrap`` through the same layout.
+        low_frequency: albedo of each vertex, ``MorphableModel.reflectance``, linear RGB.
+        faces: triangles of the vertices.
+        layout: the texture's layout.
+        cells: cells along a side of the texture in which the gain is measured.
+
+    Returns:
+        Linear RGB, the mean albedo in the empty space between the charts.
+    """
+    weight = partial_albedo.weight[..., None]
+    base = layout(low_frequency, faces)
+    size = layout.resolution
+    cell = -(-size // cells)
+    extra = cell * cells - size
+
+    def cell_sums(x: Array) -> Array:
+        padded = jnp.pad(x, ((0, extra), (0, extra), (0, 0)))
+        return jnp.sum(padded.reshape(cells, cell, cells, cell, -1), axis=(1, 3))
+
+    known = cell_sums(weight) / cell**2
+    observed, expected = cell_sums(weight * partial_albedo.albedo), cell_sums(weight * base)
+    # A specular or badly lit cell must not carry its colour over half the face.
+    gain = jnp.clip(observed / jnp.maximum(expected, 1e-6), 1 / 3, 3.0)
+    smooth = push_pull(jnp.log(gain), known[..., 0])
+    whole = jax.image.resize(smooth, (cell * cells, cell * cells, 3), "linear")
+    filled = base * jnp.exp(whole[:size, :size])
+    texture = weight * partial_albedo.albedo + (1 - weight) * filled
+    empty = (layout.triangle < 0)[..., None]
+    return jnp.where(empty, jnp.mean(low_frequency, axis=0), texture)
 
 
 def _check(
