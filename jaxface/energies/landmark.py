@@ -25,6 +25,8 @@ class LandmarkData(eqx.Module):
     """detected positions f_i (x, y), as fractions of the working image's side"""
     weight: Float[Array, "l"]
     """share of each landmark in the mean"""
+    principal: Float[Array, "2"]
+    """principal point of the camera, as fractions of the side"""
     unit: Float[Array, ""]
     """length that counts as 1, as a fraction of the side"""
 
@@ -42,7 +44,7 @@ def landmark_difference(y: FaceParameters, data: LandmarkData) -> Float[Array, "
     )
     points = jnp.einsum("li,lij->lj", data.points.weights, corners)
     posed = points @ rotation_matrix(y.rotation).T + y.translation
-    return y.camera(1).project(posed)[:, :2] - data.target
+    return y.camera(data.principal).project(posed)[:, :2] - data.target
 
 
 def landmark_residual(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 2"]:
@@ -82,7 +84,7 @@ def slide_contour(
     own_facing = jnp.sum(data.points.weights * facing[data.points.vertices], axis=-1)
     hidden = contour & (own_facing < 0.05)
 
-    screen = y.camera(1).project(posed[candidates])[:, :2]
+    screen = y.camera(data.principal).project(posed[candidates])[:, :2]
     distance = jnp.linalg.norm(data.target[:, None] - screen[None], axis=-1) / data.unit
     on_silhouette = jnp.abs(facing[candidates]) < 0.25
     distance = jnp.where(on_silhouette[None], distance, jnp.inf)

@@ -29,6 +29,8 @@ class PixelSamples(eqx.Module):
     """C_input, linear RGB"""
     weight: Float[Array, "p"]
     """share of the pixel in the mean, in [0, 1]; 0 marks unused entries"""
+    principal: Float[Array, "2"]
+    """principal point of the camera, as fractions of the side"""
 
 
 class PhotometricData(eqx.Module):
@@ -44,6 +46,7 @@ def sample_pixels(
     triangle: Int[Array, "h w"],
     faces: Int[Array, "f 3"],
     face_mask: Bool[Array, "f"],
+    principal: Float[Array, "2"],
     capacity: int,
 ) -> PixelSamples:
     """Gather the pixels that show an allowed triangle, at most ``capacity`` of them.
@@ -56,26 +59,43 @@ def sample_pixels(
         triangle: visible triangle of each pixel, -1 for the background.
         faces: the mesh.
         face_mask: triangles that take part.
+        principal: principal point of the camera, as fractions of the side.
         capacity: length of the lists.
     """
     height, width = triangle.shape
     flat = triangle.reshape(-1)
-    weights = mask.reshape(-1) * ((flat >= 0) & face_mask[flat])
-    valid = weights > 0
+    weight = mask.reshape(-1) * ((flat >= 0) & face_mask[flat])
+    y, x = jnp.divmod(jnp.arange(height * width), width)
+    everywhere = PixelSamples(
+        position=((jnp.stack([x, y], axis=-1) + 0.5) / width).astype(image.dtype),
+        triangle=faces[jnp.maximum(flat, 0)],
+        color=image.reshape(-1, 3),
+        weight=weight.astype(image.dtype),
+        principal=principal,
+    )
+    return thin_samples(everywhere, capacity)
+
+
+def thin_samples(samples: PixelSamples, capacity: int) -> PixelSamples:
+    """An evenly spread subset (in scan order) of the samples of positive weight.
+
+    At most ``capacity`` of them; weights are kept, so a mean over the subset estimates the
+    mean over all.
+    """
+    capacity = min(capacity, samples.weight.shape[0])
+    valid = samples.weight > 0
     rank = jnp.cumsum(valid) - 1
     count = rank[-1] + 1
-    slots = jnp.arange(capacity)
-    wanted = jnp.where(count > capacity, (slots * (count / capacity)).astype(jnp.int32), slots)
-    index = jnp.searchsorted(rank, jnp.minimum(wanted, count - 1))
-    used = slots < count
-    index = jnp.where(used, index, 0)
-    y, x = index // width, index % width
-    position = (jnp.stack([x, y], axis=-1) + 0.5) / width
+    slot = jnp.where(count > capacity, (rank * (capacity / count)).astype(jnp.int32), rank)
+    slot = jnp.where(valid, slot, capacity)
+    index = jnp.zeros(capacity, jnp.int32).at[slot].set(jnp.arange(len(valid)), mode="drop")
+    used = jnp.arange(capacity) < count
     return PixelSamples(
-        position=position.astype(image.dtype),
-        triangle=jnp.where(used[:, None], faces[flat[index]], 0),
-        color=image.reshape(-1, 3)[index],
-        weight=jnp.where(used, weights[index], 0.0).astype(image.dtype),
+        position=samples.position[index],
+        triangle=samples.triangle[index],
+        color=samples.color[index],
+        weight=jnp.where(used, samples.weight[index], 0.0),
+        principal=samples.principal,
     )
 
 
@@ -92,7 +112,7 @@ def synthesize(
     normals = vertex_normals(vertices, model.faces)
     used = samples.triangle
     corners = vertices[used] @ rotation.T + y.translation
-    camera = y.camera(1)
+    camera = y.camera(samples.principal)
     weights = ray_weights(pixel_rays(samples.position, camera.focal, camera.principal), corners)
     normal = jnp.einsum("pi,pij->pj", weights, normals[used]) @ rotation.T
     normal = normal / jnp.maximum(safe_norm(normal, keepdims=True), 1e-12)

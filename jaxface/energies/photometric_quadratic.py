@@ -69,7 +69,7 @@ def photometric_jacobian(
     normals = unit[tri] @ rotation.T
     albedos = reflectance[tri]
 
-    camera = y.camera(1)
+    camera = y.camera(samples.principal)
     b = ray_weights(pixel_rays(samples.position, camera.focal, camera.principal), points)
     x = jnp.einsum("pi,pij->pj", b, points)
     m = jnp.einsum("pi,pij->pj", b, normals)

@@ -29,10 +29,15 @@ class FaceParameters(eqx.Module):
         """The rigid motion from the model's frame to the camera's."""
         return Pose(self.rotation, self.translation)
 
-    def camera(self, size: int) -> Camera:
-        """The camera of a square working image ``size`` pixels wide, principal point centred."""
-        centre = jnp.full((2,), size / 2.0, self.translation.dtype)
-        return Camera(jnp.exp(self.log_focal) * size, centre)
+    def camera(self, principal: Float[Array, "2"], size: float = 1.0) -> Camera:
+        """The camera of a square working image.
+
+        Args:
+            principal: principal point as fractions of the side; it is (0.5, 0.5) only where the
+                working image is centred in the photo.
+            size: side in pixels; 1 gives a camera in fractions of the side.
+        """
+        return Camera(jnp.exp(self.log_focal) * size, principal * size)
 
 
 def neutral_parameters(model: MorphableModel, field_of_view: float = 30.0) -> FaceParameters:

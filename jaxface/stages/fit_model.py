@@ -1,0 +1,87 @@
+"""What a fit needs of a morphable model at one level of detail, prepared once."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Array, Bool, Int
+from jaxface.geometry.mesh import boundary_vertices
+from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
+from jaxface.models.morphable import MorphableModel, SurfacePoints
+
+FACE_REGIONS = ("forehead", "temples", "nose", "cheeks", "chin", "lips", "eyelids", "face")
+"""skin whose colour the photo term compares: not eyeballs, mouth, ears, scalp or neck"""
+
+OUTLINE_REGIONS = (*FACE_REGIONS, "neck", "ears")
+"""skin that may form the outline of the face"""
+
+IBUG_CONTOUR = tuple(range(17))
+"""the jaw line among the 68 points"""
+
+MEDIAPIPE_CONTOUR = (
+    10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377,
+    152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109,
+)  # fmt: skip
+"""the face oval among the 468 points"""
+
+
+
+class FitModel(eqx.Module):
+    """A morphable model with the tables that the fit gathers through."""
+
+    model: MorphableModel
+    stencil: NormalStencil
+    points: SurfacePoints
+    """landmarks in the scheme of the detection"""
+    contour: Bool[Array, "l"]
+    """landmarks that slide along the outline"""
+    outline: Int[Array, "c"]
+    """vertices that may form the outline"""
+    vertex_mask: Bool[Array, "n"]
+    """vertices of the skin that the photo term compares"""
+    face_mask: Bool[Array, "f"]
+    """triangles that the photo term compares"""
+
+
+def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
+    """Tables for fitting ``model`` to landmarks of a scheme.
+
+    Args:
+        model: the morphable model.
+        landmark_count: 68 (iBUG) or 468 (MediaPipe) detected points.
+
+    Raises:
+        ValueError: the model has no correspondences for that scheme, or no vertices.
+    """
+    points = {68: model.landmarks68, 468: model.landmarks468}.get(landmark_count)
+    if points is None:
+        known = [
+            n for n, p in ((68, model.landmarks68), (468, model.landmarks468)) if p is not None
+        ]
+        raise ValueError(
+            f"model {model.name!r} has no correspondences for {landmark_count} landmarks (it has "
+            f"them for {known or 'none'}); run `jaxface model embed-landmarks` to find them"
+        )
+    contour = np.zeros(landmark_count, bool)
+    contour[list(IBUG_CONTOUR if landmark_count == 68 else MEDIAPIPE_CONTOUR)] = True
+    faces = np.asarray(model.faces)
+    skin = _in_regions(model, FACE_REGIONS)
+    outline = _in_regions(model, OUTLINE_REGIONS)
+    outline = outline & ~boundary_vertices(faces, model.vertex_count)
+    return FitModel(
+        model=model,
+        stencil=normal_stencil(faces, model.vertex_count),
+        points=points,
+        contour=jnp.asarray(contour),
+        outline=jnp.asarray(np.flatnonzero(outline), jnp.int32),
+        vertex_mask=jnp.asarray(skin),
+        face_mask=jnp.asarray(skin[faces].all(axis=1)),
+    )
+
+
+def _in_regions(model: MorphableModel, names: tuple[str, ...]) -> np.ndarray:
+    """Vertices in any of the regions; all vertices where the model knows none of them."""
+    known = [name for name in names if name in model.region_names]
+    if not known:
+        return np.ones(model.vertex_count, bool)
+    return np.asarray(model.region_mask(*known))

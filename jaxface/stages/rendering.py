@@ -1,0 +1,49 @@
+"""Render a fit: colour, normals and which skin is compared."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxface._types import Array, Bool, Float, Int
+from jaxface.geometry.mesh import vertex_normals
+from jaxface.geometry.rotation import rotation_matrix
+from jaxface.models.parameters import FaceParameters
+from jaxface.render.interpolate import interpolate
+from jaxface.render.rasterize import rasterize
+from jaxface.render.shading import irradiance
+from jaxface.stages.fit_model import FitModel
+
+
+class FitRender(eqx.Module):
+    """What the fitted model looks like in the working image."""
+
+    color: Float[Array, "s s 3"]
+    """C_synth, linear RGB"""
+    albedo: Float[Array, "s s 3"]
+    normal: Float[Array, "s s 3"]
+    """unit, camera frame; zero on the background"""
+    triangle: Int[Array, "s s"]
+    skin: Bool[Array, "s s"]
+    """pixels whose triangle the photo term compares"""
+
+
+def render_fit(
+    y: FaceParameters, model: FitModel, principal: Float[Array, "2"], size: int
+) -> FitRender:
+    """Render the fitted face at ``size`` x ``size`` pixels of the working image."""
+    vertices = model.model.shape(y.identity, y.expression)
+    rotation = rotation_matrix(y.rotation)
+    screen = y.camera(principal, size).project(vertices @ rotation.T + y.translation)
+    faces = model.model.faces
+    fragments = rasterize(screen, faces, size, size, cull=True)
+    per_vertex = jnp.concatenate(
+        [vertex_normals(vertices, faces), model.model.reflectance(y.albedo)], axis=1
+    )
+    at_pixel = interpolate(per_vertex, faces, fragments)
+    normal = at_pixel[..., :3] @ rotation.T
+    normal = normal / jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    covered = fragments.triangle >= 0
+    color = jnp.where(
+        covered[..., None], at_pixel[..., 3:] * irradiance(normal, y.light), 0.0
+    )
+    skin = covered & model.face_mask[jnp.maximum(fragments.triangle, 0)]
+    return FitRender(color, at_pixel[..., 3:], normal, fragments.triangle, skin)
