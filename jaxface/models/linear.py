@@ -1,5 +1,7 @@
 """A linear (PCA) model: a basis whose columns are one standard deviation long."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -26,9 +28,10 @@ class LinearBasis(eqx.Module):
 
     def __call__(self, z: Float[Array, "k"]) -> Float[Array, "n 3"]:
         """Offset from the mean for coefficients ``z`` (standard deviations)."""
-        return jnp.reshape(
-            jnp.reshape(self.basis, (-1, self.count)) @ z, (*self.basis.shape[:-1],)
-        )
+        *per_vertex, count = self.basis.shape
+        # The row count is explicit because -1 is undefined for a basis without modes.
+        rows = math.prod(per_vertex)
+        return jnp.reshape(jnp.reshape(self.basis, (rows, count)) @ z, per_vertex)
 
     def truncated(self, count: int) -> "LinearBasis":
         """The first ``count`` modes."""

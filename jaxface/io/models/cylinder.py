@@ -11,35 +11,36 @@ def cylindrical_uv(
     """Project a head (mm, +y up, +z forward) onto an upright cylinder, seam at the back.
 
     ``u`` grows from the head's right to its left (the image's left to right) with the front at
-    the middle; ``v`` grows upward; both fill [0, 1] (origin bottom-left). The corners of a
-    triangle that crosses the seam are split: the low-``u`` ones continue past the right edge,
-    and the whole layout is then scaled back into [0, 1], so no triangle spans the map. Triangles
-    that fold over on the cylinder (nostrils, ears, the inside of the lips) still share texels;
-    a layout without that needs the model's own UVs.
+    the middle; ``v`` grows upward; both fill [0, 1] (origin bottom-left). A triangle that crosses
+    the seam gets corners of its own past the edge it mostly lies at, and the whole layout is then
+    scaled back into [0, 1], so no triangle spans the map. Triangles that fold over on the
+    cylinder (nostrils, ears, the inside of the lips) still share texels; a layout without that
+    needs the model's own UVs.
 
     Returns:
         The coordinates and each triangle's corners in them.
     """
-    centre_x = 0.5 * (vertices[:, 0].min() + vertices[:, 0].max())
-    # The axis of an open face goes through its back rim, so that the face spans half a turn.
-    depth = vertices[:, 2].max() - vertices[:, 2].min()
-    width = vertices[:, 0].max() - vertices[:, 0].min()
-    axis_z = vertices[:, 2].max() - min(depth, 0.6 * max(width, 1e-6))
-    angle = np.arctan2(vertices[:, 0] - centre_x, vertices[:, 2] - axis_z)
-    turn = 0.5 + angle / (2 * np.pi)
-    height = vertices[:, 1] - vertices[:, 1].min()
-    v = height / max(float(height.max()), 1e-9)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    behind = np.linalg.norm(normals[normals[:, 2] < 0], axis=1).sum()
+    closed = behind > 0.3 * np.linalg.norm(normals, axis=1).sum()
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    # The axis of a closed head is its middle; that of an open face its back rim, so that the face
+    # spans half a turn.
+    axis_z = 0.5 * (low[2] + high[2]) if closed else low[2]
+    angle = np.arctan2(vertices[:, 0] - 0.5 * (low[0] + high[0]), vertices[:, 2] - axis_z)
+    v = (vertices[:, 1] - low[1]) / max(float(high[1] - low[1]), 1e-9)
 
-    corners = turn[faces]
-    crossing = corners.max(axis=1) - corners.min(axis=1) > 0.5
-    wrapped = crossing[:, None] & (corners < 0.5)
-    moved, where = np.unique(faces[wrapped], return_inverse=True)
-    uv_faces = faces.copy()
-    uv_faces[wrapped] = len(vertices) + where
-    u = np.concatenate([turn, turn[moved] + 1.0])
-    # A vertex all of whose triangles wrapped keeps no corner of its own; it must not stretch the
-    # range, and neither must vertices outside every triangle.
-    used = np.unique(uv_faces)
-    low, high = u[used].min(), u[used].max()
-    uv = np.stack([(u - low) / max(high - low, 1e-9), np.concatenate([v, v[moved]])], axis=1)
-    return np.clip(uv, 0.0, 1.0), uv_faces
+    u = 0.5 + angle[faces] / (2 * np.pi)
+    crossing = np.ptp(u, axis=1) > 0.5
+    u = np.where(crossing[:, None] & (u < 0.5), u + 1.0, u)
+    u = np.where(crossing[:, None] & (u.mean(axis=1, keepdims=True) > 1.0), u - 1.0, u)
+    # One coordinate for each vertex and turn it appears with.
+    turn = np.rint(u - (0.5 + angle[faces] / (2 * np.pi))).astype(np.int64)
+    keys, index = np.unique(faces.astype(np.int64) * 3 + turn + 1, return_inverse=True)
+    owner = keys // 3
+    across = 0.5 + angle[owner] / (2 * np.pi) + keys % 3 - 1
+    # The same reach on both sides keeps the front in the middle.
+    reach = max(float(np.abs(across - 0.5).max()), 1e-9)
+    uv = np.stack([0.5 + 0.5 * (across - 0.5) / reach, v[owner]], axis=1)
+    return np.clip(uv, 0.0, 1.0), index.reshape(faces.shape).astype(np.int32)

@@ -18,9 +18,9 @@ MELANIN = (_WAVELENGTHS / _WAVELENGTHS[1]) ** -3.33
 # Oxyhaemoglobin's molar extinction at those wavelengths relative to green (Prahl's tables).
 HAEMOGLOBIN = np.array([0.03, 1.0, 0.75])
 
-MELANIN_STD = 0.25
+MELANIN_STD = 0.24
 """optical density of one standard deviation in green: 2 of them halve it, fair to dark skin"""
-HAEMOGLOBIN_STD = 0.12
+HAEMOGLOBIN_STD = 0.08
 
 
 def generic_skin(
