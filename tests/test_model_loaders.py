@@ -192,10 +192,9 @@ def test_bfm_h5(tmp_path, scaled) -> None:
     arrays = write_bfm_h5(path, scaled=scaled, landmarks=[("center.nose.tip", VERTICES[3])])
     model = load_model(path)
     z, e = np.array([0.5, -1, 2]), np.array([1.0, -1.5])
-    direct = sum(
-        mean + basis @ (c * std)
-        for (mean, basis, std), c in ((arrays["shape"], z), (arrays["expression"], e))
-    )
+    direct = np.zeros(3 * COUNT)
+    for (mean, basis, std), c in ((arrays["shape"], z), (arrays["expression"], e)):
+        direct = direct + mean + basis @ (c * std)
     shape = model.shape(jnp.asarray(z), jnp.asarray(e))
     np.testing.assert_allclose(shape, direct.reshape(-1, 3), rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(model.expression.std, [5, 3], rtol=1e-6)
@@ -460,7 +459,7 @@ def write_kit(folder):
 def test_ict_folder(tmp_path) -> None:
     vertices, deltas = write_kit(tmp_path / "FaceXModel")
     model = load_model(tmp_path / "FaceXModel")
-    assert model.vertex_count == COUNT and model.region_names == ("face", "head")
+    assert model.vertex_count == COUNT and "eyelids" in model.region_names
     shape = model.shape(jnp.array([1.0, -2.0]), jnp.array([0.5 / BLENDSHAPE_STD]))
     direct = vertices + deltas["identity000"] - 2 * deltas["identity001"] + 0.5 * deltas["jawOpen"]
     np.testing.assert_allclose(shape, 10 * direct[:COUNT], atol=2e-2)
@@ -520,10 +519,29 @@ def test_ict_real_folder_and_npz_agree(data_dir) -> None:
 
 def test_ict_real_eyes_and_teeth(data_dir) -> None:
     model = load_model(data_dir / "ict" / "FaceXModel_sample")
-    assert model.region_names == ("face", "head", "gums", "teeth", "left_eye", "right_eye")
-    eye = np.asarray(model.region_mask("left_eye", "right_eye"))
-    assert not np.any(np.asarray(model.albedo.basis)[eye])
-    assert np.asarray(model.mean)[np.asarray(model.region) == 4, 0].min() > 0
+    painted = np.asarray(model.region_mask("eyes"))
+    assert painted.sum() == 2 * 770  # the two eyeballs
+    assert not np.any(np.asarray(model.albedo.basis)[painted])
+    mean = np.asarray(model.mean)
+    assert np.all(np.abs(np.abs(mean[painted, 0]) - 31) < 16)
+
+
+def test_ict_real_regions_lie_where_their_names_say(data_dir) -> None:
+    model = load_model(data_dir / "ict" / "ict_facehead_f16.npz")
+    assert model.landmarks68 is not None
+    mean, marks = np.asarray(model.mean), np.asarray(model.landmarks68(model.mean))
+    middle = {
+        name: mean[np.asarray(model.region_mask(name))].mean(axis=0)
+        for name in ("forehead", "nose", "lips", "chin", "neck", "scalp", "eyelids")
+    }
+    heights = [middle[name][1] for name in ("forehead", "eyelids", "nose", "lips", "chin", "neck")]
+    assert heights == sorted(heights, reverse=True)
+    assert middle["scalp"][2] < middle["forehead"][2] < middle["nose"][2]
+    for name, numbers in {"nose": [29, 30], "lips": [51, 57], "eyelids": [37, 47]}.items():
+        vertices = np.asarray(model.landmarks68.vertices)[numbers, 0]
+        assert np.all(np.asarray(model.region_mask(name))[vertices]), name
+    lips = mean[np.asarray(model.region_mask("lips"))]
+    assert abs(np.ptp(lips[:, 0]) / np.ptp(marks[48:60, 0]) - 1) < 0.2
 
 
 # What every format shares ----------------------------------------------------------------------

@@ -25,6 +25,7 @@ def test_round_trip_with_everything(tmp_path) -> None:
         texture=texture, comment="CC0\nnobody",
     )  # fmt: skip
     mesh = read_obj(path)
+    assert mesh.uv is not None and mesh.normals is not None
     np.testing.assert_allclose(mesh.vertices, SQUARE)
     np.testing.assert_array_equal(mesh.polygons, POLYGONS)
     np.testing.assert_allclose(mesh.uv, UV)
@@ -41,7 +42,7 @@ def test_round_trip_with_everything(tmp_path) -> None:
 def test_trimesh_reads_the_same(tmp_path) -> None:
     path = tmp_path / "mesh.obj"
     write_obj(path, SQUARE, POLYGONS)
-    other = trimesh.load(path, process=False)
+    other = trimesh.load_mesh(path, process=False)
     np.testing.assert_allclose(other.vertices, SQUARE)
     assert len(other.faces) == 3
     np.testing.assert_allclose(other.area, 100 + 10 * np.hypot(10, 1) / 2)

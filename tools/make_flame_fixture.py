@@ -50,7 +50,7 @@ def rig() -> dict:
 
 def main() -> None:
     # chumpy predates Python 3.11, which dropped this name.
-    inspect.getargspec = inspect.getfullargspec
+    setattr(inspect, "getargspec", inspect.getfullargspec)  # noqa: B010
     import chumpy
     import scipy.sparse
 

@@ -1,6 +1,6 @@
 """From a file's arrays to a `MorphableModel`: checks, orientation, and what a format lacks."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,13 +8,14 @@ import numpy as np
 
 from jaxface._types import Float, Int
 from jaxface.io.models.cylinder import cylindrical_uv
+from jaxface.io.models.regions import REGIONS, label_regions
 from jaxface.io.models.skin import generic_skin
 from jaxface.models.linear import LinearBasis, empty_basis
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 
-BLENDSHAPE_STD = 1.0 / 3.0
+BLENDSHAPE_STD = 0.5
 """standard deviation given to blendshape weights, which come without statistics: the full
-expression, weight one, is then a 3-sigma event"""
+expression, weight one, is then a 2-sigma event, as in the bundled model"""
 
 
 class ModelFormatError(ValueError):
@@ -53,7 +54,7 @@ class SourceModel:
     uv_quads: Int[np.ndarray, "q 4"] | None = None
     landmarks68: SurfacePoints | None = None
     region: Int[np.ndarray, "n"] | None = None
-    region_names: tuple[str, ...] = field(default=("head",))
+    region_names: tuple[str, ...] = ("head",)
 
 
 def require(condition: bool, path: str | Path, found: str, needed: str) -> None:
@@ -103,7 +104,8 @@ def assemble(source: SourceModel) -> MorphableModel:
     """Check a source model and fill in what its format lacks.
 
     Without UVs a cylindrical projection is made (`cylindrical_uv`), without an albedo a generic
-    skin (`generic_skin`), without expressions an empty basis. Triangles are turned outward.
+    skin (`generic_skin`), without expressions an empty basis, without regions but with landmarks
+    those of `label_regions`. Triangles are turned outward.
 
     Raises:
         ModelFormatError: shapes disagree, an index is out of range, or a value is not finite.
@@ -132,10 +134,8 @@ def assemble(source: SourceModel) -> MorphableModel:
     elif flipped:
         uv_faces = np.ascontiguousarray(uv_faces[:, ::-1])
     albedo_mean, albedo = source.albedo_mean, source.albedo
+    points = landmark_positions(source.mean, source.landmarks68)
     if albedo_mean is None:
-        points = None
-        if source.landmarks68 is not None:
-            points = np.asarray(source.landmarks68(jnp.asarray(source.mean, jnp.float32)))
         albedo_mean, basis, std = generic_skin(source.mean, points)
         albedo = Modes(basis, std)
     elif albedo is None:
@@ -148,7 +148,11 @@ def assemble(source: SourceModel) -> MorphableModel:
         f"mean albedo of shape {albedo_mean.shape}",
         f"finite numbers of shape ({count}, 3)",
     )
-    region = np.zeros(count, np.int32) if source.region is None else source.region
+    region, region_names = source.region, source.region_names
+    if points is not None and region is None:
+        region, region_names = label_regions(source.mean, faces, points), REGIONS
+    elif region is None:
+        region = np.zeros(count, np.int32)
     quads, uv_quads = source.quads, source.uv_quads
     if quads is not None and flipped:
         quads, uv_quads = _reversed_quads(quads), _reversed_quads(uv_quads)
@@ -165,12 +169,21 @@ def assemble(source: SourceModel) -> MorphableModel:
         landmarks468=None,
         region=jnp.asarray(region, jnp.int32),
         name=source.name,
-        region_names=source.region_names,
+        region_names=region_names,
         expression_names=tuple(names),
         licence=source.licence,
         quads=None if quads is None else jnp.asarray(quads, jnp.int32),
         uv_quads=None if uv_quads is None else jnp.asarray(uv_quads, jnp.int32),
     )
+
+
+def landmark_positions(
+    mean: Float[np.ndarray, "n 3"], points: SurfacePoints | None
+) -> Float[np.ndarray, "l 3"] | None:
+    """Positions of landmarks on a shape (mm), None without landmarks."""
+    if points is None:
+        return None
+    return np.einsum("li,lic->lc", np.asarray(points.weights), mean[np.asarray(points.vertices)])
 
 
 def _linear(modes: Modes) -> LinearBasis:

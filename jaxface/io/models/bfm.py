@@ -37,7 +37,8 @@ def load_bfm2009(
 
     ``shapeEV`` and ``texEV`` are standard deviations although their name says eigenvalues. The
     texture, sRGB 0-255, becomes linear light (see `linear_albedo`). The four segments of
-    ``segbin``, where present, become regions. The model has no expressions, UVs or landmarks.
+    ``segbin``, where present, become regions unless landmarks give finer ones. The file has no
+    expressions, UVs or landmarks.
 
     Args:
         path: a MATLAB file of version 5 to 7.3.
@@ -66,8 +67,9 @@ def load_bfm2009(
         texture_mean / 255.0, texture, _vector(content["texEV"]) / 255.0
     )
     faces = triangles.astype(np.int64).astype(np.int32) - 1  # MATLAB counts from one
+    points = read_landmarks68(landmarks, faces, len(mean))
     region, names = None, ("head",)
-    if "segbin" in content:
+    if "segbin" in content and points is None:
         segments = np.asarray(content["segbin"])
         require(
             segments.ndim == 2 and len(segments) == len(mean),
@@ -89,7 +91,7 @@ def load_bfm2009(
             albedo=albedo,
             region=region,
             region_names=names,
-            landmarks68=read_landmarks68(landmarks, faces, len(mean)),
+            landmarks68=points,
         )
     )
 

@@ -21,6 +21,7 @@ from jaxface.io.models.assemble import (
     require,
 )
 from jaxface.io.models.landmarks import vertex_points
+from jaxface.io.models.regions import REGIONS, label_regions
 from jaxface.io.models.skin import generic_skin, paint_parts
 from jaxface.io.obj import read_obj, read_obj_vertices, triangles
 from jaxface.io.restricted_pickle import load_npz
@@ -38,7 +39,7 @@ PARTS = {
     "left_eye": "M_ScleraLeft",
     "right_eye": "M_ScleraRight",
 }
-"""region name -> the kit's material. Left out are the transparent layers over the eyes (fluid,
+"""part -> the kit's material. Left out are the transparent layers over the eyes (fluid,
 blend, occlusion, lashes) and the irises, which lie inside the opaque eyeballs."""
 
 _TILES = {
@@ -187,14 +188,18 @@ def _build(
     kept_uv, renumber_uv = _compact(uv_polygons, len(uv))
     uv_quads = np.where(uv_polygons >= 0, renumber_uv[uv_polygons], -1).astype(np.int32)
     is_quad = quads[:, 3] >= 0
-    region = np.zeros(len(kept), np.int32)
+    part = np.zeros(len(kept), np.int32)
     for index in reversed(range(len(names))):  # a vertex on a border counts to the first part
         of_part = quads[materials == wanted[index]]
-        region[np.unique(of_part[of_part >= 0])] = index
+        part[np.unique(of_part[of_part >= 0])] = index
     mean, deltas = vertices[kept] * scale, deltas[kept] * scale
     located = bool(np.all(landmarks >= 0))
-    albedo_mean, albedo, std = generic_skin(mean, mean[landmarks] if located else None)
-    albedo_mean, albedo = paint_parts(mean, region, tuple(names), albedo_mean, albedo)
+    points = mean[landmarks] if located else None
+    albedo_mean, albedo, std = generic_skin(mean, points)
+    albedo_mean, albedo = paint_parts(mean, part, tuple(names), albedo_mean, albedo)
+    region, region_names = part, tuple(names)
+    if points is not None:
+        region, region_names = _regions(mean, triangles(quads), points, part, names), REGIONS
     expressions = deltas.shape[-1] - identity_count
     return assemble(
         SourceModel(
@@ -216,9 +221,24 @@ def _build(
             uv_quads=uv_quads,
             landmarks68=vertex_points(landmarks) if located else None,
             region=region,
-            region_names=tuple(names),
+            region_names=region_names,
         )
     )
+
+
+def _regions(
+    mean: np.ndarray, faces: np.ndarray, points: np.ndarray, part: np.ndarray, names: list[str]
+) -> np.ndarray:
+    """Labels from the landmarks, corrected by what the kit's materials are known to be."""
+    region = label_regions(mean, faces, points)
+    for index, name in enumerate(names):
+        inside = part == index
+        if name == "head":  # its socket of the mouth lies behind the face, that of the eye too
+            outside = [REGIONS.index(r) for r in ("scalp", "neck", "eyelids")]
+            region[inside & ~np.isin(region, outside)] = REGIONS.index("mouth_interior")
+        elif name != "face":
+            region[inside] = REGIONS.index("eyes" if name.endswith("_eye") else "mouth_interior")
+    return region
 
 
 def _compact(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
