@@ -17,7 +17,7 @@ YIQ_TO_RGB = np.linalg.inv(RGB_TO_YIQ)
 
 
 def srgb_to_linear(encoded: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Linear light of sRGB-encoded values (IEC 61966-2-1, exact pieces, odd below zero).
+    """Decode sRGB values to linear light (IEC 61966-2-1, exact pieces, odd below zero).
 
     Value and derivative are finite everywhere; values outside [0, 1] follow the same curve.
     """
@@ -28,7 +28,7 @@ def srgb_to_linear(encoded: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def linear_to_srgb(linear: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """sRGB encoding of linear light (IEC 61966-2-1, exact pieces, odd below zero).
+    """Encode linear light as sRGB (IEC 61966-2-1, exact pieces, odd below zero).
 
     Value and derivative are finite everywhere; values outside [0, 1] follow the same curve.
     """

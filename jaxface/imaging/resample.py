@@ -13,10 +13,10 @@ from jaxface._types import Array, Float
 def bilinear(
     image: Float[Array, "h w c"], points: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch c"]:
-    """Values at ``points`` (x, y), bilinear between pixel centres; the border pixel goes on outside.
+    """Values at ``points`` (x, y), bilinear between pixel centres.
 
-    The derivative with respect to a point is that of the patch it lies in, and zero outside the
-    image.
+    Outside the image the border pixel goes on. The derivative with respect to a point is that of
+    the cell it lies in, and zero outside the image.
     """
     height, width = image.shape[0], image.shape[1]
     x = jnp.clip(points[..., 0] - 0.5, 0, width - 1)
@@ -69,9 +69,7 @@ def resize_weights(source: int, target: int) -> Float[Array, "target source"]:
     return weights / jnp.sum(weights, axis=1, keepdims=True)
 
 
-def resize(
-    image: Float[Array, "h w c"], height: int, width: int
-) -> Float[Array, "height width c"]:
+def resize(image: Float[Array, "h w c"], height: int, width: int) -> Float[Array, "height width c"]:
     """The image at another size, antialiased where it shrinks (separable triangle filter)."""
     rows = resize_weights(image.shape[0], height)
     columns = resize_weights(image.shape[1], width)

@@ -59,13 +59,12 @@ class PhotoPyramid:
         columns, column_weights = _taps(width, corner[0] / factor, scale, size)
         top, left = rows.min(), columns.min()
         part = self._part(index, slice(top, rows.max() + 1), slice(left, columns.max() + 1))
-        shrunk = sum(
-            part[:, rows[:, t] - top] * row_weights[:, t, None] for t in range(rows.shape[1])
-        )
-        result = sum(
-            shrunk[:, :, columns[:, t] - left] * column_weights[:, t]
-            for t in range(columns.shape[1])
-        )
+        shrunk = np.zeros((3, size, part.shape[2]), np.float32)
+        for taps, weights in zip(rows.T, row_weights.T, strict=True):
+            shrunk += part[:, taps - top] * weights[:, None]
+        result = np.zeros((3, size, size), np.float32)
+        for taps, weights in zip(columns.T, column_weights.T, strict=True):
+            result += shrunk[:, :, taps - left] * weights
         return np.ascontiguousarray(np.moveaxis(result, 0, -1))
 
     def patch(
@@ -81,8 +80,8 @@ class PhotoPyramid:
             size: side of the patch.
 
         Returns:
-            The patch (channels first), its corner (x, y) in the pixels of the level, and the factor by which the
-            level is smaller: a patch point p is the photo's ``factor * (corner + p)``.
+            The patch (channels first), its corner (x, y) in the pixels of the level, and the factor
+            by which the level is smaller: a patch point p is the photo's ``factor * (corner + p)``.
         """
         index = max(0, math.ceil(math.log2(2 * (reach + 1) / size)))
         factor = 2**index
@@ -98,9 +97,7 @@ class PhotoPyramid:
         if index == 0:
             return self._photo.shape[0], self._photo.shape[1]
         while len(self._halves) < index:
-            finer = (
-                self._halves[-1] if self._halves else np.moveaxis(self._photo, -1, 0)
-            )
+            finer = self._halves[-1] if self._halves else np.moveaxis(self._photo, -1, 0)
             self._halves.append(_halve(finer))
         return self._halves[index - 1].shape[1], self._halves[index - 1].shape[2]
 
@@ -110,6 +107,36 @@ class PhotoPyramid:
         scale = np.float32(1 / 255 if self._photo.dtype == np.uint8 else 1)
         part = self._photo[rows, columns]
         return np.stack([np.multiply(part[..., c], scale, dtype=np.float32) for c in range(3)])
+
+
+def tile_corners(
+    width: float, height: float, side: float, overlap: float
+) -> list[tuple[float, float]]:
+    """Corners (x, y) of square tiles that cover a photo and overlap by at least a share of a side.
+
+    Tiles are spread evenly; along an axis shorter than a tile one tile is centred.
+    """
+
+    def starts(length: float) -> list[float]:
+        if length <= side:
+            return [(length - side) / 2]
+        count = math.ceil((length - side) / (side * (1 - overlap))) + 1
+        return [float(start) for start in np.linspace(0, length - side, count)]
+
+    return [(left, top) for top in starts(height) for left in starts(width)]
+
+
+def unturn(points: Float[np.ndarray, "*batch 2"], turns: int, size: float) -> np.ndarray:
+    """Where points of a square picture turned by ``np.rot90(picture, turns)`` lie in the picture.
+
+    Args:
+        points: x, y in the turned picture.
+        turns: quarter turns, counter-clockwise.
+        size: side of the picture.
+    """
+    for _ in range(turns):
+        points = np.stack([size - points[..., 1], points[..., 0]], axis=-1)
+    return points
 
 
 def _halve(image: Shaped[np.ndarray, "3 h w"]) -> Float[np.ndarray, "3 h2 w2"]:

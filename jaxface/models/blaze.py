@@ -4,6 +4,7 @@ Bazarevsky et al., "BlazeFace: Sub-millisecond Neural Face Detection on Mobile G
 section 3. Features are (height, width, channels); batches come from ``jax.vmap``.
 """
 
+import functools
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -86,16 +87,15 @@ def depthwise_convolution(
     """
     height, width, _ = x.shape
     size = kernel.shape[0]
-    x = jnp.pad(
-        x, (same_padding(height, size, stride), same_padding(width, size, stride), (0, 0))
-    )
+    x = jnp.pad(x, (same_padding(height, size, stride), same_padding(width, size, stride), (0, 0)))
     rows, columns = -(-height // stride), -(-width // stride)
-    return sum(
+    products = (
         kernel[i, j]
         * x[i : i + stride * (rows - 1) + 1 : stride, j : j + stride * (columns - 1) + 1 : stride]
         for i in range(size)
         for j in range(size)
     )
+    return functools.reduce(jnp.add, products)
 
 
 def chain(layers: tuple[Convolution | ResidualBlock, ...], x: Float[Array, "h w i"]) -> Array:

@@ -27,11 +27,11 @@ _ANCHOR_GRIDS = ((16, 2), (8, 6))
 class Candidates(eqx.Module):
     """What the detector says at each anchor, best first after ``suppress``."""
 
-    boxes: Float[Array, "n 4"]
+    boxes: Float[Array | np.ndarray, "n 4"]
     """left, top, right, bottom, px"""
-    keypoints: Float[Array, "n 6 2"]
+    keypoints: Float[Array | np.ndarray, "n 6 2"]
     """see ``KEYPOINTS``; x, y px"""
-    scores: Float[Array, "n"]
+    scores: Float[Array | np.ndarray, "n"]
     """probability of a face"""
 
 
@@ -43,7 +43,7 @@ class FaceDetector(eqx.Module):
     score_heads: tuple[Convolution | ResidualBlock, ...]
     box_heads: tuple[Convolution | ResidualBlock, ...]
 
-    def __call__(self, picture: Float[Array, "128 128 3"]) -> Candidates:
+    def __call__(self, picture: Float[Array | np.ndarray, "128 128 3"]) -> Candidates:
         """All 896 anchors' boxes (px of the picture) and scores; sRGB-encoded RGB in [0, 1]."""
         fine = chain(self.fine, 2 * picture - 1)
         maps = (fine, chain(self.coarse, fine))

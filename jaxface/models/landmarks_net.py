@@ -33,7 +33,9 @@ class LandmarkNet(eqx.Module):
 
     trunk: tuple[Convolution | ResidualBlock, ...]
     points: tuple[Convolution | ResidualBlock, ...]
+    points_head: Convolution
     presence: tuple[Convolution | ResidualBlock, ...]
+    presence_head: Convolution
     mirror: Int[Array, "468"]
     """index of each point's mirror image"""
 
@@ -45,22 +47,32 @@ class LandmarkNet(eqx.Module):
         The crop is sRGB-encoded RGB in [0, 1]; presence is a probability.
         """
         features = chain(self.trunk, crop)
-        points = _head(self.points[-1], chain(self.points[:-1], features))
-        logit = _head(self.presence[-1], chain(self.presence[:-1], features))
+        points = _whole_map(self.points_head, chain(self.points, features))
+        logit = _whole_map(self.presence_head, chain(self.presence, features))
         return points.reshape(-1, 3), jax.nn.sigmoid(logit[0])
 
 
-def _head(layer: Convolution | ResidualBlock, x: Float[Array, "k k i"]) -> Float[Array, "o"]:
+def _whole_map(layer: Convolution, x: Float[Array, "k k i"]) -> Float[Array, "o"]:
     # The last convolution covers the whole 3x3 map, without padding.
     return jnp.einsum("hwi,hwio->o", x, layer.kernel) + layer.bias
 
 
 def read_landmark_net(arrays: Mapping[str, np.ndarray]) -> LandmarkNet:
-    """The network from its named weights (float32)."""
+    """The network from its named weights (float32).
+
+    Raises:
+        ValueError: a part is missing, or a branch does not end in a convolution.
+    """
+    *points, points_head = read_chain(arrays, "mesh/points", halving=(0,))
+    *presence, presence_head = read_chain(arrays, "mesh/presence", halving=(0,))
+    if not (isinstance(points_head, Convolution) and isinstance(presence_head, Convolution)):
+        raise ValueError("mesh/points and mesh/presence must end in a convolution")
     return LandmarkNet(
         trunk=read_chain(arrays, "mesh/trunk", halving=(0, 3, 6, 9, 12)),
-        points=read_chain(arrays, "mesh/points", halving=(0,)),
-        presence=read_chain(arrays, "mesh/presence", halving=(0,)),
+        points=tuple(points),
+        points_head=points_head,
+        presence=tuple(presence),
+        presence_head=presence_head,
         mirror=jnp.asarray(arrays["mesh/mirror"], jnp.int32),
     )
 
@@ -92,7 +104,7 @@ def rotation_2d(angle: Float[Array, ""]) -> Float[Array, "2 2"]:
 def region_from_eyes(
     box: Float[Array, "4"], right_eye: Float[Array, "2"], left_eye: Float[Array, "2"]
 ) -> Region:
-    """Region for a detected box, upright along the line from the subject's right eye to the left."""
+    """Region for a detected box, level with the subject's eyes."""
     across = left_eye - right_eye
     side = REGION_MARGIN * jnp.max(box[2:] - box[:2])
     return Region((box[:2] + box[2:]) / 2, side, jnp.arctan2(across[1], across[0]))
@@ -120,18 +132,39 @@ def landmarks_in_region(
 
     Differentiable with respect to the image (sRGB-encoded, [0, 1]) and to the region.
     """
+    points, presence = net(_crop(image, region))
+    return _from_crop(points, region), presence
+
+
+def symmetric_landmarks(
+    net: LandmarkNet, image: Float[Array, "h w 3"], region: Region
+) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
+    """As ``landmarks_in_region``, the mean over the crop and its mirror image.
+
+    The network is not quite symmetric: the two differ by about 1% of the distance between the
+    eyes, and their mean moves a third as much as either when the crop moves a little.
+    """
+    crop = _crop(image, region)
+    points, presence = jax.vmap(net)(jnp.stack([crop, crop[:, ::-1]]))
+    unmirrored = points[1][net.mirror] * jnp.array([-1, 1, 1]) + jnp.array([CROP_SIZE, 0, 0])
+    return _from_crop((points[0] + unmirrored) / 2, region), jnp.mean(presence)
+
+
+def _crop(image: Float[Array, "h w 3"], region: Region) -> Float[Array, "192 192 3"]:
+    return affine_crop(image, region.transform(), CROP_SIZE, CROP_SIZE)
+
+
+def _from_crop(points: Float[Array, "468 3"], region: Region) -> Float[Array, "468 3"]:
     transform = region.transform()
-    crop = affine_crop(image, transform, CROP_SIZE, CROP_SIZE)
-    points, presence = net(crop)
     flat = points[:, :2] @ transform[:, :2].T + transform[:, 2]
     depth = points[:, 2:] * (region.side / CROP_SIZE)
-    return jnp.concatenate([flat, depth], axis=1), presence
+    return jnp.concatenate([flat, depth], axis=1)
 
 
 def refine_landmarks(
     net: LandmarkNet, image: Float[Array, "h w 3"], region: Region, passes: int = 2
 ) -> tuple[Float[Array, "468 3"], Float[Array, ""]]:
-    """Points and presence after ``passes`` rounds, each in the region that the last one's points give.
+    """Points and presence after some rounds, each in the region that the last one's points give.
 
     Raises:
         ValueError: ``passes`` is less than 1.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxface._types import Array, Float, Shaped
 from jaxface.imaging.pyramid import halve
 from jaxface.imaging.resample import affine_crop
-from jaxface.imaging.windows import PhotoPyramid
+from jaxface.imaging.windows import PhotoPyramid, tile_corners, unturn
 from jaxface.models.face_detector import (
     DETECTOR_SIZE,
     Candidates,
@@ -23,10 +23,10 @@ from jaxface.models.face_detector import (
 from jaxface.models.landmarks_net import (
     LandmarkNet,
     Region,
-    landmarks_in_region,
     read_landmark_net,
     region_from_eyes,
     region_from_landmarks,
+    symmetric_landmarks,
 )
 
 SMALLEST_FACE = 40.0
@@ -35,7 +35,7 @@ SMALLEST_FACE = 40.0
 # The detector finds faces wider than this share of its picture. Tiles overlap by twice as much,
 # so that any face is whole in one of them until the next coarser tiles can see it.
 _FACE_SHARE = 0.16
-_TILE_STEP = 1 - 2 * _FACE_SHARE
+_TILE_OVERLAP = 2 * _FACE_SHARE
 # Turned photos are tried on the whole and on tiles down to a quarter, where they are few.
 _TURNED_SCALES = 3
 # The pixels that a face is read from: they hold its region at any angle, and room to move it.
@@ -44,6 +44,7 @@ _REACH = 0.95
 # Looks at a face at most, and the move of its region (share of the side) that ends them.
 _MAX_LOOKS = 5
 _STILL = 0.02
+_OTHER_SIZES = (0.92, 1.08)
 # The second opinion on a face: side of the picture over that of the landmarks' region, how far
 # from its middle (px) a detection counts, and the score below which other turns are tried.
 _LEVEL_MARGIN = 4 / 3
@@ -183,14 +184,6 @@ def _tile_sides(longest: float, smallest: float) -> list[float]:
     return sides
 
 
-def _tile_starts(length: float, side: float) -> np.ndarray:
-    # Evenly spread; a photo shorter than the tile is centred in it.
-    if length <= side:
-        return np.array([(length - side) / 2])
-    count = int(np.ceil((length - side) / (side * _TILE_STEP))) + 1
-    return np.linspace(0, length - side, count)
-
-
 def _candidates(
     nets: LandmarkNetworks, photo: PhotoPyramid, side: float, turns: int, min_score: float
 ) -> Candidates:
@@ -198,38 +191,26 @@ def _candidates(
     width, height = photo.size
     scale = side / DETECTOR_SIZE
     boxes, keypoints, scores = [], [], []
-    for top in _tile_starts(height, side):
-        for left in _tile_starts(width, side):
-            picture = np.rot90(photo.picture((left, top), side, DETECTOR_SIZE), turns)
-            found = jax.tree.map(np.asarray, _detect(nets.detector, picture))
-            good = found.scores >= min_score
-            corner = np.array([left, top])
-            points = np.concatenate([found.boxes[good].reshape(-1, 2, 2), found.keypoints[good]], 1)
-            points = corner + scale * _unturn(points, turns)
-            low, high = points[:, :2].min(axis=1), points[:, :2].max(axis=1)
-            boxes.append(np.concatenate([low, high], axis=1))
-            keypoints.append(points[:, 2:])
-            scores.append(found.scores[good])
+    for corner in tile_corners(width, height, side, _TILE_OVERLAP):
+        picture = np.rot90(photo.picture(corner, side, DETECTOR_SIZE), turns)
+        found = jax.tree.map(np.asarray, _detect(nets.detector, picture))
+        good = found.scores >= min_score
+        points = np.concatenate([found.boxes[good].reshape(-1, 2, 2), found.keypoints[good]], 1)
+        points = np.array(corner) + scale * unturn(points, turns, DETECTOR_SIZE)
+        low, high = points[:, :2].min(axis=1), points[:, :2].max(axis=1)
+        boxes.append(np.concatenate([low, high], axis=1))
+        keypoints.append(points[:, 2:])
+        scores.append(found.scores[good])
     return Candidates(np.concatenate(boxes), np.concatenate(keypoints), np.concatenate(scores))
-
-
-def _unturn(points: np.ndarray, turns: int) -> np.ndarray:
-    # Where points of a picture turned by np.rot90 (counter-clockwise) lie in the picture itself.
-    for _ in range(turns):
-        points = np.stack([DETECTOR_SIZE - points[..., 1], points[..., 0]], axis=-1)
-    return points
 
 
 def _landmarks(
     nets: LandmarkNetworks, photo: PhotoPyramid, box: np.ndarray, keypoints: np.ndarray
 ) -> DetectedFace:
-    region = jax.tree.map(np.asarray, region_from_eyes(box, keypoints[0], keypoints[1]))
-    patch, corner, factor = photo.patch(region.centre, _REACH * float(region.side), _PATCH_SIZE)
-    local = Region(
-        np.asarray(region.centre / factor - corner, np.float32),
-        np.asarray(region.side / factor, np.float32),
-        np.asarray(region.angle, np.float32),
-    )
+    region = _first_region(*(jnp.asarray(x, jnp.float32) for x in (box, *keypoints[:2])))
+    centre = (float(region.centre[0]), float(region.centre[1]))
+    patch, corner, factor = photo.patch(centre, _REACH * float(region.side), _PATCH_SIZE)
+    local = Region(region.centre / factor - corner, region.side / factor, region.angle)
     points, presence, local = _settle(nets.mesh, patch, local)
     # The mesh is sure of itself upside down and on blobs. A face seen level convinces the
     # detector, and more so than any other turn of it does.
@@ -241,24 +222,28 @@ def _landmarks(
     if turns:
         turned = Region(local.centre, local.side, local.angle + np.float32(turns * np.pi / 2))
         points, presence, _ = _settle(nets.mesh, patch, turned)
-    landmarks = (np.asarray(points) + np.append(corner, 0)) * factor
+    landmarks = (points + np.append(corner, 0)) * factor
     low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
-    return DetectedFace(np.concatenate([low, high]), scores[turns], landmarks, float(presence))
+    return DetectedFace(np.concatenate([low, high]), scores[turns], landmarks, presence)
 
 
 def _settle(
     mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
-) -> tuple[Array, Array, Region]:
+) -> tuple[np.ndarray, float, Region]:
     # Look until the region that the points give is the one they were found in. A detection's
-    # region is rough, so the first look never counts.
-    landmarks, presence, region = _look(mesh, patch, region)
+    # region is rough, so the first look never counts. Then average over a few sizes of it.
+    _, _, region = _look(mesh, patch, region)
     for _ in range(_MAX_LOOKS - 1):
-        landmarks, presence, moved = _look(mesh, patch, region)
-        shift = np.max(np.abs(np.asarray(moved.centre) - np.asarray(region.centre)))
-        region, still = moved, max(shift, abs(moved.side - region.side)) < _STILL * moved.side
-        if still:
+        before = region
+        points, presence, region = _look(mesh, patch, before)
+        shift = np.max(np.abs(np.asarray(region.centre) - np.asarray(before.centre)))
+        if max(shift, abs(region.side - before.side)) < _STILL * region.side:
             break
-    return landmarks, presence, region
+    others = [
+        _look(mesh, patch, Region(before.centre, before.side * np.float32(k), before.angle))[0]
+        for k in _OTHER_SIZES
+    ]
+    return np.mean([points, *others], axis=0), float(presence), region
 
 
 def _central_score(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> float:
@@ -271,6 +256,9 @@ def _central_score(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3
 
 def _is_new(face: DetectedFace, faces: list[DetectedFace]) -> bool:
     return not faces or bool(np.all(overlap(face.box, np.array([f.box for f in faces])) < 0.3))
+
+
+_first_region = jax.jit(region_from_eyes)
 
 
 @jax.jit
@@ -288,7 +276,7 @@ def _level_picture(patch: Float[np.ndarray, "3 p p"], region: Region) -> Array:
 @jax.jit
 def _look(
     mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
-) -> tuple[Float[np.ndarray, "468 3"], Float[np.ndarray, ""], Region]:
+) -> tuple[Float[Array, "468 3"], Float[Array, ""], Region]:
     # Points, presence, and the region to look at next.
-    landmarks, presence = landmarks_in_region(mesh, jnp.moveaxis(patch, 0, -1), region)
+    landmarks, presence = symmetric_landmarks(mesh, jnp.moveaxis(patch, 0, -1), region)
     return landmarks, presence, region_from_landmarks(landmarks)
