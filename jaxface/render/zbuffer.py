@@ -23,7 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxface._types import Array, Float, Int
+from jaxface._types import Array, Bool, Float, Int
 from jaxface.render.coverage import (
     TILE_COLUMNS,
     TILE_PIXELS,
@@ -93,40 +93,45 @@ def nearest_triangles(
     buffer = Buffer(
         jnp.full((pixels,), jnp.inf, x[0].dtype), jnp.full((pixels,), NONE, jnp.int32)
     )
-    buffer, rest = _draw(buffer, tiles, ROUNDS, height, width, cull)
+    buffer, rest = _draw(buffer, tiles, _bits(tiles, cull), ROUNDS, height, width)
 
-    # The first tile is drawn again if bits were left: a fragment twice does no harm.
-    across = -(-tiles.columns // TILE_COLUMNS)
-    skip = jnp.where(rest != 0, 0, 1)
-    wanted = jnp.maximum(across * -(-tiles.rows // TILE_ROWS) - skip, 0)
-    rank = jax.lax.associative_scan(jnp.add, (wanted > 0).astype(jnp.int32))
-    queue = jnp.zeros((scenes * count + BATCH,), jnp.int32)
-    queue = queue.at[jnp.where(wanted > 0, rank - 1, queue.size)].set(triangle, mode="drop")
-    length = rank[-1]
+    # Few-fragment tiles first: a batch takes as many rounds as its fullest tile.
+    large = (tiles.columns > TILE_COLUMNS) | (tiles.rows > TILE_ROWS)
+    few = ~large & (jax.lax.population_count(rest) <= ROUNDS)
+    first, second = _running_count(few & (rest != 0)), _running_count(~few)
+    length = first[-1] + second[-1]
+    place = jnp.where(few, jnp.where(rest != 0, first - 1, length), first[-1] + second - 1)
+    place = jnp.where(place < length, place, scenes * count + BATCH)
+    queue = jnp.zeros((scenes * count + BATCH,), jnp.int32).at[place].set(triangle, mode="drop")
 
     def draw_batch(state):
         cursor, done, buffer = state
         window = jax.lax.dynamic_slice(queue, (cursor,), (BATCH,))
         slot = jnp.arange(BATCH, dtype=jnp.int32)
-        left_over = jnp.where(cursor + slot < length, wanted[window], 0).at[0].add(-done)
+        box = jax.tree.map(lambda v: v[window], tiles)
+        across = -(-box.columns // TILE_COLUMNS)
+        skip = jnp.where(rest[window] != 0, 0, 1)
+        wanted = across * -(-box.rows // TILE_ROWS) - skip
+        left_over = jnp.where(cursor + slot < length, wanted, 0).at[0].add(-done)
         left_over = jnp.minimum(left_over, BATCH + 1)  # so that the sum cannot overflow
         ends = jnp.cumsum(left_over, dtype=jnp.int32)
         starts = ends - left_over
         mark = jnp.zeros((BATCH,), jnp.int32)
         mark = mark.at[starts].add((left_over > 0).astype(jnp.int32), mode="drop")
         owner = jnp.cumsum(mark, dtype=jnp.int32) - 1
-        t = window[owner]
-        tile = slot - starts[owner] + jnp.where(owner == 0, done, 0) + skip[t]
-        shift_x = tile % jnp.maximum(across[t], 1) * TILE_COLUMNS
-        shift_y = tile // jnp.maximum(across[t], 1) * TILE_ROWS
-        here = jax.tree.map(lambda v: v[t], tiles)
+        live = slot < ends[-1]
+        tile = slot - starts[owner] + jnp.where(owner == 0, done, 0) + skip[owner]
+        shift_x = tile % jnp.maximum(across[owner], 1) * TILE_COLUMNS
+        shift_y = tile // jnp.maximum(across[owner], 1) * TILE_ROWS
+        here = jax.tree.map(lambda v: v[window[owner]], tiles)
         here = here._replace(
             left=here.left + shift_x,
             top=here.top + shift_y,
-            columns=jnp.where(slot < ends[-1], here.columns - shift_x, 0),
+            columns=jnp.where(live, here.columns - shift_x, 0),
             rows=here.rows - shift_y,
         )
-        buffer, _ = _draw(buffer, here, TILE_PIXELS, height, width, cull)
+        bits = jnp.where(tile == 0, jnp.where(live, rest[here.triangle], 0), _bits(here, cull))
+        buffer, _ = _draw(buffer, here, bits, TILE_PIXELS, height, width)
         finished = jnp.sum(ends <= BATCH, dtype=jnp.int32)
         begun = jnp.where(finished == 0, done + BATCH, BATCH - starts[finished])
         return cursor + finished, jnp.where(finished < BATCH, begun, 0), buffer
@@ -137,14 +142,28 @@ def nearest_triangles(
     return nearest.reshape(scenes, height, width)
 
 
+def _bits(tiles: Tiles, cull: bool) -> Int[Array, "t"]:
+    return tile_bits(tiles.x, tiles.y, tiles.left, tiles.top, tiles.columns, tiles.rows, cull)
+
+
+def _running_count(flags: Bool[Array, "t"]) -> Int[Array, "t"]:
+    """How many flags are set up to and with each: a prefix sum in two levels.
+
+    Blocks are summed by a triangular matrix, since XLA's own prefix sum takes longer on a CPU than
+    all the drawing; zeros and ones are exact in any precision of multiplication.
+    """
+    blocks = jnp.pad(flags, (0, -flags.size % 128)).reshape(-1, 128).astype(jnp.float32)
+    inner = blocks @ jnp.triu(jnp.ones((128, 128), jnp.float32))
+    inner = inner.astype(jnp.int32)
+    before = jnp.cumsum(inner[:, -1], dtype=jnp.int32) - inner[:, -1]
+    return (inner + before[:, None]).reshape(-1)[: flags.size]
+
+
 def _draw(
-    buffer: Buffer, tiles: Tiles, rounds: int, height: int, width: int, cull: bool
+    buffer: Buffer, tiles: Tiles, bits: Int[Array, "t"], rounds: int, height: int, width: int
 ) -> tuple[Buffer, Int[Array, "t"]]:
     """The first ``rounds`` fragments of each tile into the buffer, and the bits not drawn."""
     pixels = buffer.depth.shape[0]
-    bits = tile_bits(
-        tiles.x, tiles.y, tiles.left, tiles.top, tiles.columns, tiles.rows, cull
-    )
 
     def fragment(rest):
         place = jax.lax.population_count((rest & -rest) - 1)
