@@ -75,6 +75,7 @@ def test_units_uv_seams_and_texture(tmp_path) -> None:
     np.testing.assert_allclose(uv[index], UV[UV_FACES] * [1, -1] + [0, 1], atol=1e-7)
     expected = vertex_normals(VERTICES, FACES)
     np.testing.assert_allclose(normal[index], expected[FACES], atol=1e-6)
+    assert primitive.attributes.POSITION is not None
     accessor = document.accessors[primitive.attributes.POSITION]
     np.testing.assert_allclose(accessor.max, [0.1] * 3)
     np.testing.assert_allclose(accessor.min, [0.0] * 3)

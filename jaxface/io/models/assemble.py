@@ -66,7 +66,7 @@ def require(condition: bool, path: str | Path, found: str, needed: str) -> None:
 def vertex_major(
     path: str | Path, name: str, matrix: np.ndarray, columns: int | None = None
 ) -> np.ndarray:
-    """A ``(3n, k)`` matrix of x y z x y z ... rows as ``(n, 3, k)`` float64.
+    """A ``(3n, k)`` matrix of x y z x y z ... rows as ``(n, 3, k)`` float32.
 
     Raises:
         ModelFormatError: not two-dimensional, rows not a multiple of three, or not ``columns``.
@@ -80,12 +80,12 @@ def vertex_major(
         f"{name} of shape {matrix.shape} and type {matrix.dtype}",
         f"numbers of shape (3n, {columns_wanted})",
     )
-    return matrix.astype(np.float64).reshape(-1, 3, matrix.shape[1])
+    return matrix.astype(np.float32, copy=False).reshape(-1, 3, matrix.shape[1])
 
 
 def scaled_modes(basis: Float[np.ndarray, "n 3 k"], std: Float[np.ndarray, "k"]) -> Modes:
     """Unit-length modes times their standard deviations."""
-    return Modes(basis * std, std)
+    return Modes(basis * std.astype(basis.dtype), std)
 
 
 def outward(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> np.ndarray:

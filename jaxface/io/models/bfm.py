@@ -188,7 +188,7 @@ def _statismo(file: Any, path: Path, group: str) -> tuple[np.ndarray, Modes] | N
     # statismo before 0.9 stored columns already multiplied by their standard deviation.
     norms = np.linalg.norm(basis.reshape(-1, len(std)), axis=0)
     scaled = norms.max(initial=0) > 1.05 and bool(np.allclose(norms, std, rtol=0.02))
-    return mean, Modes(basis if scaled else basis * std, std)
+    return mean, Modes(basis, std) if scaled else scaled_modes(basis, std)
 
 
 def _dataset(file: Any, path: Path, name: str) -> np.ndarray:

@@ -26,4 +26,5 @@ def linear_albedo(
     root = (np.maximum(encoded, 0.04045) + 0.055) / 1.055
     decoded = np.where(dark, encoded / 12.92, root**2.4)
     slope = np.where(dark, 1 / 12.92, 2.4 / 1.055 * root**1.4)
-    return decoded, Modes(slope[..., None] * basis * std, np.asarray(std, np.float64))
+    std = np.asarray(std, np.float64)
+    return decoded, Modes(basis * (slope[..., None] * std).astype(basis.dtype), std)

@@ -45,7 +45,7 @@ def load_flame(
     ``shapedirs`` holds identity, then 100 expressions (300 + 100 since 2019). Rotations of the
     jaw join the expressions as their derivative at the closed mouth (`joint_derivative`), one
     standard deviation 0.1 rad; a rotation by ``t`` is then wrong by ``r t^2 / 2`` at distance
-    ``r`` from the joint: 2% of ``r`` (1.6 mm at a chin 80 mm away) at 0.2 rad. FLAME stores no
+    ``r`` from the joint: 2% of ``r`` at 0.2 rad, which moves it by 20% of ``r``. FLAME stores no
     albedo and no landmarks: a generic skin is put on, and ``landmarks`` takes its embeddings.
 
     Args:

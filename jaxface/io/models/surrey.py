@@ -15,6 +15,7 @@ from jaxface.io.models.assemble import (
     SourceModel,
     assemble,
     require,
+    scaled_modes,
     vertex_major,
 )
 from jaxface.io.models.cereal import CerealReader
@@ -143,8 +144,9 @@ def load_surrey(
             f"{len(mean)}",
         )
         mean = mean + expression.mean.reshape(-1, 3)
-        modes = Modes(vertex_major(path, "expression basis", expression.basis), expression.std)
-        modes.basis = modes.basis * modes.std
+        modes = scaled_modes(
+            vertex_major(path, "expression basis", expression.basis), expression.std
+        )
     elif expression is not None and expression.names:
         deformations = vertex_major(blendshapes or path, "blendshapes", expression.basis)
         modes = Modes(deformations * BLENDSHAPE_STD, np.full(len(expression.names), BLENDSHAPE_STD))
@@ -162,7 +164,7 @@ def load_surrey(
             licence=_LICENCE,
             mean=mean,
             faces=faces,
-            identity=Modes(basis * shape.std, shape.std),
+            identity=scaled_modes(basis, shape.std),
             expression=modes,
             expression_names=tuple(names),
             albedo_mean=albedo_mean,
