@@ -14,5 +14,6 @@ def interpolate(
     Differentiable in ``values`` and, through the weights of ``fragments``, in the vertices. Also
     serves quantities indexed otherwise than the vertices (UV corners with their own ``faces``).
     """
-    corner = values[faces[jnp.maximum(fragments.triangle, 0)]]
-    return jnp.einsum("hwi,hwic->hwc", fragments.barycentric, corner)
+    seen = jnp.maximum(fragments.triangle, 0)
+    weights = fragments.barycentric[..., None]
+    return sum(weights[..., i, :] * values[faces[:, i][seen]] for i in range(3))
