@@ -15,6 +15,7 @@ import pygltflib as gltf
 from jaxface._types import Float, Int
 from jaxface.geometry.camera import Pose
 from jaxface.io.atomic import atomic_path
+from jaxface.io.mesh_checks import check_indices, check_table
 
 _METRES = 1e-3
 _FINEST_MORPH = 1e-6  # m: a morph moves a vertex at least a micrometre or not at all
@@ -81,11 +82,27 @@ def write_glb(
         ValueError: shapes disagree, an index is out of range, a value is not finite, a weight
             names no morph, or the texture is neither PNG nor JPEG.
     """
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    morphs, weights = dict(morphs or {}), dict(weights or {})
-    _check(vertices, faces, uv, uv_faces, normals, colours, morphs, weights)
-    normals = vertex_normals(vertices, faces) if normals is None else np.asarray(normals)
-    source, corner_uv, triangles = _split_seams(len(vertices), faces, uv, uv_faces)
+    vertices = check_table("vertices", vertices, 3)
+    count = len(vertices)
+    faces = check_indices("faces", faces, count, (3,))
+    if not len(faces):
+        raise ValueError("faces is empty; needed at least one triangle")
+    if uv is not None:
+        uv = check_table("uv", uv, 2)
+        uv_faces = check_indices(
+            "uv_faces", faces if uv_faces is None else uv_faces, len(uv), (3,), like=faces
+        )
+    if normals is None:
+        normals = vertex_normals(vertices, faces)
+    normals = check_table("normals", normals, 3, count)
+    displacements = {key: check_table(key, d, 3, count) for key, d in (morphs or {}).items()}
+    weights = dict(weights or {})
+    unknown = [key for key in weights if key not in displacements]
+    if unknown:
+        raise ValueError(
+            f"weights name {unknown}, which are no morphs; those are {list(morphs or {})}"
+        )
+    source, corner_uv, triangles = _split_seams(count, faces, uv, uv_faces)
 
     pack = _Packer(licence)
     # UVs are written even without a texture, for editors to paint by.
@@ -96,10 +113,11 @@ def write_glb(
     if corner_uv is not None:
         attributes.TEXCOORD_0 = pack.floats(corner_uv * [1.0, -1.0] + [0.0, 1.0])
     if colours is not None:
-        attributes.COLOR_0 = pack.floats(np.clip(np.asarray(colours)[source], 0, 1))
+        albedo = check_table("colours", colours, 3, count)
+        attributes.COLOR_0 = pack.floats(np.clip(albedo[source], 0, 1))
     targets = [
-        gltf.Attributes(POSITION=pack.displacements(np.asarray(delta)[source] * _METRES))
-        for delta in morphs.values()
+        gltf.Attributes(POSITION=pack.displacements(delta[source] * _METRES))
+        for delta in displacements.values()
     ]
     primitive = gltf.Primitive(
         attributes=attributes,
@@ -109,8 +127,8 @@ def write_glb(
     mesh = gltf.Mesh(primitives=[primitive], name=name)
     if targets:
         primitive.targets = targets
-        mesh.weights = [float(weights.get(key, 0.0)) for key in morphs]
-        mesh.extras = {"targetNames": list(morphs)}
+        mesh.weights = [float(weights.get(key, 0.0)) for key in displacements]
+        mesh.extras = {"targetNames": list(displacements)}
     node = gltf.Node(mesh=0, name=name, extras=dict(extras or {}))
     if pose is not None:
         node.rotation = _quaternion(np.asarray(pose.rotation, np.float64))
@@ -251,12 +269,11 @@ def _split_seams(
     count: int, faces: np.ndarray, uv: np.ndarray | None, uv_faces: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """One output vertex for each pair (vertex, uv): its vertex, its uv, and the triangles."""
-    if uv is None:
+    if uv is None or uv_faces is None:
         return np.arange(count), None, faces
-    corners = faces if uv_faces is None else np.asarray(uv_faces)
-    keys = faces.ravel().astype(np.int64) * len(uv) + corners.ravel()
+    keys = faces.ravel().astype(np.int64) * len(uv) + uv_faces.ravel()
     pairs, index = np.unique(keys, return_inverse=True)
-    return pairs // len(uv), np.asarray(uv)[pairs % len(uv)], index.reshape(faces.shape)
+    return pairs // len(uv), uv[pairs % len(uv)], index.reshape(faces.shape)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -283,44 +300,3 @@ def _add_camera(document: gltf.GLTF2, camera: GlbCamera) -> None:
     document.cameras = [gltf.Camera(type="perspective", perspective=lens)]
     document.nodes.append(gltf.Node(camera=0, name="photo camera"))
     document.scenes = [gltf.Scene(nodes=[0, 1])]
-
-
-def _check(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    uv: np.ndarray | None,
-    uv_faces: np.ndarray | None,
-    normals: np.ndarray | None,
-    colours: np.ndarray | None,
-    morphs: Mapping[str, np.ndarray],
-    weights: Mapping[str, float],
-) -> None:
-    count = len(vertices)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or count == 0:
-        raise ValueError(f"vertices of shape {vertices.shape}; needed (n, 3) with n > 0")
-    tables = {"vertices": vertices, "normals": normals, "colours": colours, **morphs}
-    for key, table in tables.items():
-        if table is not None and np.shape(table) != (count, 3):
-            raise ValueError(f"{key} of shape {np.shape(table)}; needed {(count, 3)}")
-        if table is not None and not np.isfinite(table).all():
-            raise ValueError(f"{key} has NaN or Inf; needed finite numbers")
-    _check_triangles("faces", faces, count)
-    if uv is not None:
-        if np.ndim(uv) != 2 or np.shape(uv)[1] != 2 or not np.isfinite(uv).all():
-            raise ValueError(f"uv of shape {np.shape(uv)}; needed finite numbers of shape (m, 2)")
-        corners = faces if uv_faces is None else np.asarray(uv_faces)
-        _check_triangles("uv_faces", corners, len(uv))
-        if corners.shape != faces.shape:
-            raise ValueError(f"uv_faces of shape {corners.shape}; needed {faces.shape}")
-    unknown = [key for key in weights if key not in morphs]
-    if unknown:
-        raise ValueError(f"weights name {unknown}, which are no morphs; those are {list(morphs)}")
-
-
-def _check_triangles(name: str, table: np.ndarray, limit: int) -> None:
-    if table.ndim != 2 or table.shape[1] != 3 or table.dtype.kind not in "iu" or not len(table):
-        raise ValueError(f"{name} of shape {table.shape} and {table.dtype}; needed (f, 3) integers")
-    if table.min() < 0 or table.max() >= limit:
-        raise ValueError(
-            f"{name} has indices {table.min()} to {table.max()}; needed 0 to {limit - 1}"
-        )

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxface._types import Float, Int
 from jaxface.io.atomic import atomic_path
+from jaxface.io.mesh_checks import check_indices, check_table
 
 
 @dataclass(frozen=True)
@@ -237,25 +238,15 @@ def write_obj(
         ValueError: shapes disagree, an index is out of range, or a value is not finite.
     """
     path = Path(path)
-    vertices, polygons = np.asarray(vertices, np.float64), np.asarray(polygons)
-    _check_table("vertices", vertices, 3)
-    _check_indices("polygons", polygons, len(vertices))
+    vertices = check_table("vertices", vertices, 3)
+    polygons = check_indices("polygons", polygons, len(vertices), (3, 4))
     tables = [polygons]
     if uv is not None:
-        uv = np.asarray(uv, np.float64)
-        _check_table("uv", uv, 2)
-        corners = polygons if uv_polygons is None else np.asarray(uv_polygons)
-        _check_indices("uv_polygons", corners, len(uv))
-        if corners.shape != polygons.shape:
-            raise ValueError(f"uv_polygons of shape {corners.shape}; needed {polygons.shape}")
-        tables.append(corners)
+        uv = check_table("uv", uv, 2)
+        corners = polygons if uv_polygons is None else uv_polygons
+        tables.append(check_indices("uv_polygons", corners, len(uv), (3, 4), like=polygons))
     if normals is not None:
-        normals = np.asarray(normals, np.float64)
-        _check_table("normals", normals, 3)
-        if len(normals) != len(vertices):
-            raise ValueError(
-                f"{len(normals)} normals for {len(vertices)} vertices; needed one each"
-            )
+        normals = check_table("normals", normals, 3, len(vertices))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     if texture is not None:
         lines += [f"mtllib {path.stem}.mtl"]
@@ -291,18 +282,3 @@ def _face_lines(tables: list[np.ndarray], with_normals: bool) -> list[str]:
             words.append(word)
         lines.append("f " + " ".join(words))
     return lines
-
-
-def _check_table(name: str, values: np.ndarray, width: int) -> None:
-    if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
-        raise ValueError(f"{name} of shape {values.shape}; needed finite numbers, (n, {width})")
-
-
-def _check_indices(name: str, table: np.ndarray, limit: int) -> None:
-    if table.ndim != 2 or table.shape[1] not in (3, 4) or table.dtype.kind not in "iu":
-        raise ValueError(f"{name} of shape {table.shape} and {table.dtype}; needed (q, 3 or 4) int")
-    lowest = -1 if table.shape[1] == 4 else 0
-    if table.size and (table.min() < lowest or table[:, :3].min() < 0 or table.max() >= limit):
-        raise ValueError(
-            f"{name} has indices {table.min()} to {table.max()}; needed 0 to {limit - 1}"
-        )

@@ -138,9 +138,7 @@ def assemble(source: SourceModel) -> MorphableModel:
     if albedo_mean is None:
         albedo_mean, basis, std = generic_skin(source.mean, points)
         albedo = Modes(basis, std)
-    elif albedo is None:
-        albedo = Modes(np.zeros((count, 3, 0)), np.zeros(0))
-    assert albedo is not None
+    albedo = albedo or Modes(np.zeros((count, 3, 0)), np.zeros(0))
     _check_modes(path, "albedo", albedo, count)
     require(
         albedo_mean.shape == (count, 3) and bool(np.all(np.isfinite(albedo_mean))),
