@@ -8,7 +8,7 @@ term means the same at every resolution and pyramid level.
 import equinox as eqx
 import jax.numpy as jnp
 
-from jaxface._types import Array, Bool, Float, Int
+from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import MorphableModel, SurfacePoints
@@ -56,7 +56,7 @@ def landmark_residual(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 
 def slide_contour(
     y: FaceParameters,
     data: LandmarkData,
-    contour: Bool[Array, "l"],
+    contour: Int[Array, "k"],
     candidates: Int[Array, "c"],
     reach: float = 0.35,
 ) -> LandmarkData:
@@ -70,7 +70,7 @@ def slide_contour(
     Args:
         y: current estimate, held fixed (the choice is discrete; no gradient passes).
         data: the landmarks.
-        contour: which landmarks may slide.
+        contour: indices of the landmarks that may slide.
         candidates: vertices that may form the silhouette (face, jaw and neck skin).
         reach: greatest distance, in ``data.unit``, between a detection and its new point.
     """
@@ -81,20 +81,22 @@ def slide_contour(
     posed = vertices @ rotation.T + y.translation
     view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
     facing = jnp.sum(normals * view, axis=-1)
-    own_facing = jnp.sum(data.points.weights * facing[data.points.vertices], axis=-1)
-    hidden = contour & (own_facing < 0.05)
+    at_contour = SurfacePoints(data.points.vertices[contour], data.points.weights[contour])
+    hidden = at_contour(facing[:, None])[:, 0] < 0.05
 
     screen = y.camera(data.principal).project(posed[candidates])[:, :2]
-    distance = jnp.linalg.norm(data.target[:, None] - screen[None], axis=-1) / data.unit
+    target = data.target[contour]
+    distance = jnp.linalg.norm(target[:, None] - screen[None], axis=-1) / data.unit
     on_silhouette = jnp.abs(facing[candidates]) < 0.25
     distance = jnp.where(on_silhouette[None], distance, jnp.inf)
-    best = jnp.argmin(distance, axis=1)
+    nearest = jnp.argmin(distance, axis=1)
     near = jnp.min(distance, axis=1) < reach
-    slid = jnp.broadcast_to(candidates[best][:, None], data.points.vertices.shape)
-    vertex_weight = jnp.array([1.0, 0.0, 0.0], model.mean.dtype)
+    slid = jnp.broadcast_to(candidates[nearest][:, None], at_contour.vertices.shape)
+    moved = (hidden & near)[:, None]
+    corner = jnp.array([1.0, 0.0, 0.0], model.mean.dtype)
     points = SurfacePoints(
-        jnp.where((hidden & near)[:, None], slid, data.points.vertices),
-        jnp.where((hidden & near)[:, None], vertex_weight, data.points.weights),
+        data.points.vertices.at[contour].set(jnp.where(moved, slid, at_contour.vertices)),
+        data.points.weights.at[contour].set(jnp.where(moved, corner, at_contour.weights)),
     )
-    weight = jnp.where(hidden & ~near, 0.0, data.weight)
+    weight = data.weight.at[contour].multiply(jnp.where(hidden & ~near, 0.0, 1.0))
     return eqx.tree_at(lambda d: (d.points, d.weight), data, (points, weight))

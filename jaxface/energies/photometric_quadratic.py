@@ -24,6 +24,7 @@ from jaxface.energies.photometric import (
     reweighting,
 )
 from jaxface.energies.term import Quadratic
+from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.normal_stencil import NormalStencil, normal_derivative
 from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import rotation_matrix
@@ -35,6 +36,14 @@ from jaxface.render.shading import irradiance, sh_basis
 def shape_basis(model: MorphableModel) -> Float[Array, "n 3 k"]:
     """Identity and expression modes side by side, in the order of ``FaceParameters``."""
     return jnp.concatenate([model.identity.basis, model.expression.basis], axis=-1)
+
+
+def normal_modes(
+    y: FaceParameters, model: MorphableModel, stencil: NormalStencil
+) -> Float[Array, "n 3 k"]:
+    """Derivative of the unit vertex normals (model frame) along every shape mode at ``y``."""
+    vertices = model.shape(y.identity, y.expression)
+    return normal_derivative(vertices, stencil, shape_basis(model))[1]
 
 
 def _interpolate(weights, values, corners):
@@ -49,22 +58,29 @@ def _interpolate(weights, values, corners):
 def photometric_jacobian(
     y: FaceParameters,
     model: MorphableModel,
-    stencil: NormalStencil,
+    normal_modes: Float[Array, "n 3 k"],
     samples: PixelSamples,
 ) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 q"]]:
     """``C_synth`` at the samples and its exact Jacobian in the flattened unknowns.
 
     Columns are ordered as ``jax.flatten_util.ravel_pytree`` orders ``FaceParameters``. Visibility
-    is held fixed, as in ``synthesize``, whose forward-mode Jacobian this equals to rounding.
+    is held fixed, as in ``synthesize``, whose forward-mode Jacobian this equals to rounding if
+    ``normal_modes`` belong to the same shape.
+
+    Args:
+        y: the unknowns.
+        model: the morphable model.
+        normal_modes: derivative of the unit vertex normals along every mode (``normal_modes``).
+        samples: the pixels.
     """
     basis = shape_basis(model)
     vertices = model.shape(y.identity, y.expression)
-    unit, unit_change = normal_derivative(vertices, stencil, basis)
+    tri = samples.triangle
+    unit = vertex_normals(vertices, model.faces)
     reflectance = model.reflectance(y.albedo)
 
     rotation = rotation_matrix(y.rotation)
     rotation_change = jax.jacfwd(rotation_matrix)(y.rotation)  # (3, 3, 3): d R / d w_k
-    tri = samples.triangle
     points = vertices[tri] @ rotation.T + y.translation  # (p, 3 corners, 3)
     normals = unit[tri] @ rotation.T
     albedos = reflectance[tri]
@@ -107,7 +123,7 @@ def photometric_jacobian(
     slope = jnp.where(edge_on[:, :, None], 0.0, slope)
 
     u_modes = _interpolate(b, basis, tri)
-    n_modes = _interpolate(b, unit_change, tri)
+    n_modes = _interpolate(b, normal_modes, tri)
     j_shape = (slope @ rotation) @ u_modes + (d @ rotation) @ n_modes
 
     x_model = jnp.einsum("pi,pij->pj", b, vertices[tri])
@@ -131,17 +147,18 @@ def photometric_jacobian(
 def photometric_quadratic(
     y: FaceParameters,
     data: PhotometricData,
-    stencil: NormalStencil,
+    normal_modes: Float[Array, "n 3 k"],
     curvature_samples: PixelSamples | None = None,
 ) -> Quadratic:
     """Value, gradient and Gauss-Newton curvature of ``E_c``.
 
     The curvature is that of the IRLS majoriser (``reweighting``). The gradient is exact for all
     samples; with ``curvature_samples`` it comes from one reverse pass over them while the
-    Jacobian is formed on that smaller, evenly spread list only.
+    Jacobian is formed on that smaller, evenly spread list only. ``normal_modes`` may then come
+    from a nearby shape: that changes the curvature slightly and the gradient not at all.
     """
     sampled = data.samples if curvature_samples is None else curvature_samples
-    synth, jacobian = photometric_jacobian(y, data.model, stencil, sampled)
+    synth, jacobian = photometric_jacobian(y, data.model, normal_modes, sampled)
     used = sampled.weight[:, None] > 0
     difference = jnp.where(used, sampled.color - synth, 0.0)
     weight = reweighting(difference, sampled.weight)

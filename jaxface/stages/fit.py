@@ -21,11 +21,10 @@ from jaxface.energies.photometric import (
     synthesize,
     thin_samples,
 )
-from jaxface.energies.photometric_quadratic import photometric_quadratic
+from jaxface.energies.photometric_quadratic import normal_modes, photometric_quadratic
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.energies.term import Energy, Term, compose
 from jaxface.geometry.mesh import vertex_normals
-from jaxface.geometry.normal_stencil import NormalStencil
 from jaxface.geometry.pose import pose_from_landmarks
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.pyramid import pyramid
@@ -57,7 +56,7 @@ class FitConfig(eqx.Module):
     """Gauss-Newton steps on each pyramid level, coarsest first"""
     landmark_steps: int = eqx.field(static=True, default=15)
     """steps on landmarks and prior alone, before the first level"""
-    curvature_pixels: int = eqx.field(static=True, default=12000)
+    curvature_pixels: int = eqx.field(static=True, default=6000)
     """pixels (evenly spread) on which the Jacobian is formed; the gradient uses all"""
     rtol: float = eqx.field(static=True, default=1e-5)
     extra_terms: tuple[Term, ...] = eqx.field(static=True, default=())
@@ -91,7 +90,8 @@ class FitData(eqx.Module):
     photo: PhotometricData
     curvature_samples: PixelSamples
     landmark: LandmarkData
-    stencil: NormalStencil
+    normal_modes: Float[Array, "n 3 k"]
+    """derivative of the vertex normals along the shape modes, from the start of the level"""
     focal_prior: tuple[Array, Array]
 
 
@@ -113,7 +113,7 @@ def fit_energy(weights: FitWeights, extra_terms: Sequence[Term] = ()) -> Energy:
                 lambda y, d: photometric_energy(y, d.photo),
                 weights.photo,
                 "scalar",
-                lambda y, d: photometric_quadratic(y, d.photo, d.stencil, d.curvature_samples),
+                lambda y, d: photometric_quadratic(y, d.photo, d.normal_modes, d.curvature_samples),
             ),
             *_geometric_terms(weights),
             Term("light", lambda y, d: light_residual(y), weights.light),
@@ -160,7 +160,8 @@ def fit_input_to_parameters(
             quadratic=energy.quadratic,
             refresh=lambda y, args: observe(y, *args, curvature_pixels=config.curvature_pixels),
         )
-        args = (image, mask, data, model)
+        modes = normal_modes(y, model.model, model.stencil)
+        args = (image, mask, data, model, modes)
         solution = gauss_newton(problem, y, args, steps=steps, rtol=config.rtol)
         y = solution.value
         histories.append(solution.stats["history"])
@@ -174,6 +175,7 @@ def observe(
     mask: Float[Array, "s s"],
     data: FitInput,
     model: FitModel,
+    modes: Float[Array, "n 3 k"],
     *,
     curvature_pixels: int,
 ) -> FitData:
@@ -196,7 +198,7 @@ def observe(
         photo=PhotometricData(model.model, samples),
         curvature_samples=thin_samples(samples, curvature_pixels),
         landmark=slide_contour(y, landmark_data(data, model), model.contour, model.outline),
-        stencil=model.stencil,
+        normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
     )
 
@@ -228,7 +230,7 @@ def _fit_landmarks(data: FitInput, model: FitModel, weights: FitWeights, config:
     y = neutral_parameters(model.model)
     y = eqx.tree_at(lambda p: p.log_focal, y, data.log_focal)
     # The outline moves with the viewpoint; the inner points alone give a steadier first pose.
-    inner = data.landmark_weight * ~model.contour
+    inner = data.landmark_weight.at[model.contour].set(0.0)
     rotation, translation = pose_from_landmarks(
         model.points(model.model.mean),
         data.landmarks,

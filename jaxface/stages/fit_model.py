@@ -33,8 +33,8 @@ class FitModel(eqx.Module):
     stencil: NormalStencil
     points: SurfacePoints
     """landmarks in the scheme of the detection"""
-    contour: Bool[Array, "l"]
-    """landmarks that slide along the outline"""
+    contour: Int[Array, "k"]
+    """indices of the landmarks that slide along the outline"""
     outline: Int[Array, "c"]
     """vertices that may form the outline"""
     vertex_mask: Bool[Array, "n"]
@@ -62,8 +62,7 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
             f"model {model.name!r} has no correspondences for {landmark_count} landmarks (it has "
             f"them for {known or 'none'}); run `jaxface model embed-landmarks` to find them"
         )
-    contour = np.zeros(landmark_count, bool)
-    contour[list(IBUG_CONTOUR if landmark_count == 68 else MEDIAPIPE_CONTOUR)] = True
+    contour = IBUG_CONTOUR if landmark_count == 68 else MEDIAPIPE_CONTOUR
     faces = np.asarray(model.faces)
     skin = _in_regions(model, FACE_REGIONS)
     outline = _in_regions(model, OUTLINE_REGIONS)
@@ -72,7 +71,7 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
         model=model,
         stencil=normal_stencil(faces, model.vertex_count),
         points=points,
-        contour=jnp.asarray(contour),
+        contour=jnp.asarray(contour, jnp.int32),
         outline=jnp.asarray(np.flatnonzero(outline), jnp.int32),
         vertex_mask=jnp.asarray(skin),
         face_mask=jnp.asarray(skin[faces].all(axis=1)),

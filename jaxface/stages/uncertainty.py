@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float
-from jaxface.energies.photometric_quadratic import shape_basis
+from jaxface.energies.photometric_quadratic import normal_modes, shape_basis
 from jaxface.models.parameters import FaceParameters
 from jaxface.solvers.gauss_newton import posterior_covariance
 from jaxface.stages.fit import FitConfig, FitInput, FitWeights, fit_energy, observe
@@ -23,7 +23,6 @@ class Posterior(eqx.Module):
 def posterior(
     y: FaceParameters,
     data: FitInput,
-    mask: Float[Array, "s s"],
     model: FitModel,
     weights: FitWeights,
     config: FitConfig,
@@ -38,12 +37,14 @@ def posterior(
     Args:
         y: the fitted parameters.
         data: the fit's input.
-        mask: pixel weights that the fit ended with.
         model: the finest level of detail.
         weights: the term weights of the fit.
         config: its settings.
     """
-    observed = observe(y, data.image, mask, data, model, curvature_pixels=config.curvature_pixels)
+    modes = normal_modes(y, model.model, model.stencil)
+    observed = observe(
+        y, data.image, data.mask, data, model, modes, curvature_pixels=config.curvature_pixels
+    )
     quadratic, _ = fit_energy(weights, config.extra_terms).quadratic(y, observed)
     covariance = posterior_covariance(quadratic.curvature, 2 * weights.prior)
     basis = shape_basis(model.model)
