@@ -14,7 +14,9 @@ FACE_OVAL_468 = (
 """The rim of the 468-point MediaPipe face mesh, in order from the middle of the hairline."""
 
 
-def smoothstep(x: Float[Array, "*s"], start: float, stop: float) -> Float[Array, "*s"]:
+def smoothstep(
+    x: Float[Array, "*s"], start: float | Float[Array, ""], stop: float | Float[Array, ""]
+) -> Float[Array, "*s"]:
     """0 up to ``start``, 1 from ``stop``, the cubic ``t^2 (3 - 2 t)`` between (slope 0 at both)."""
     t = jnp.clip((x - start) / (stop - start), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

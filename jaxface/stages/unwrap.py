@@ -5,7 +5,6 @@ found there is divided by the shading of the fitted light at the point's normal.
 does not show well fades out by a smooth weight.
 """
 
-import math
 from functools import partial
 
 import equinox as eqx
@@ -32,14 +31,10 @@ class PartialAlbedo(eqx.Module):
     weight: Float[Array, "r r"]
     """smooth confidence in [0, 1]; continued into the gutter around the charts"""
     visible: Bool[Array, "r r"]
-    """True where the photo shows the texel: inside a chart, facing the camera, unoccluded, within
-    the mask and the photo, at any angle"""
+    """True where the photo shows the texel, at any angle: inside a chart, facing the camera, not
+    hidden, within the photo and (to a texel's footprint) the mask, off the contours' pixels"""
 
 
-@partial(
-    jax.jit,
-    static_argnames=("grazing", "feather_width", "shading_floor", "depth_size", "tile"),
-)
 def unwrap(
     photo: Float[Array, "h w 3"],
     mask: Shaped[Array, "h w"],
@@ -88,6 +83,29 @@ def unwrap(
             out of range.
     """
     _check(photo, mask, faces, layout, grazing, shading_floor)
+    cosines = jnp.cos(jnp.deg2rad(jnp.asarray(grazing, photo.dtype)))
+    return _unwrap(
+        photo, mask, vertices, faces, camera, light, layout, cosines, shading_floor,
+        feather_width=feather_width, depth_size=depth_size, tile=min(tile, layout.resolution),
+    )  # fmt: skip
+
+
+@partial(jax.jit, static_argnames=("feather_width", "depth_size", "tile"))
+def _unwrap(
+    photo: Array,
+    mask: Array,
+    vertices: Array,
+    faces: Array,
+    camera: Camera,
+    light: Array,
+    layout: UVLayout,
+    cosines: Array,
+    shading_floor: Array,
+    *,
+    feather_width: float,
+    depth_size: int,
+    tile: int,
+) -> PartialAlbedo:
     height, width = photo.shape[:2]
     buffer = depth_buffer(vertices, faces, camera, height, width, depth_size)
     alpha = _confidence(mask, buffer, feather_width).astype(photo.dtype)
@@ -99,7 +117,6 @@ def unwrap(
         3 * jnp.sum(front), 1
     )
     floor = jax.lax.stop_gradient(jnp.maximum(shading_floor * lit, 1e-6))
-    cos_zero, cos_one = (math.cos(math.radians(angle)) for angle in grazing)
     table, alive = _triangles(vertices, normals, faces, camera, layout, (width, height))
 
     # Every quantity of a tile is one vector of texels per component: loops over a short last
@@ -125,7 +142,7 @@ def unwrap(
         basis = sh_basis(normal)
         shading = [sum(basis[:, k] * light[k, rgb] for k in range(9)) for rgb in range(3)]
         darkest = jnp.minimum(jnp.minimum(shading[0], shading[1]), shading[2])
-        weight = smoothstep(cosine, cos_zero, cos_one) * cover * seen
+        weight = smoothstep(cosine, cosines[0], cosines[1]) * cover * seen
         weight = weight * smoothstep(darkest, floor, 2 * floor)
         inverse = 1.0 / jnp.maximum(cover, 1e-4)
         albedo = [
@@ -134,7 +151,7 @@ def unwrap(
         ]
         return jnp.stack(albedo, axis=-1), weight, seen & (cover > 0)
 
-    return _by_tiles(texels, layout, alive, min(tile, layout.resolution), photo.dtype)
+    return _by_tiles(texels, layout, alive, tile, photo.dtype)
 
 
 def _dot(a: Array, b: Array) -> Array:
