@@ -33,7 +33,7 @@ class Convolution(eqx.Module):
             padding = same_padding(x.shape[0], size, self.stride)
         y = jax.lax.conv_general_dilated(
             x[None],
-            self.kernel,
+            self.kernel.astype(x.dtype),
             (self.stride, self.stride),
             (padding, padding),
             dimension_numbers=("NHWC", "HWIO", "NHWC"),

@@ -45,7 +45,7 @@ class FaceDetector(eqx.Module):
 
     def __call__(self, picture: Float[Array | np.ndarray, "128 128 3"]) -> Candidates:
         """All 896 anchors' boxes (px of the picture) and scores; sRGB-encoded RGB in [0, 1]."""
-        fine = chain(self.fine, 2 * picture - 1)
+        fine = chain(self.fine, 2 * jnp.asarray(picture) - 1)
         maps = (fine, chain(self.coarse, fine))
         logits = [head(x).reshape(-1) for head, x in zip(self.score_heads, maps, strict=True)]
         raw = [head(x).reshape(-1, 8, 2) for head, x in zip(self.box_heads, maps, strict=True)]
