@@ -4,7 +4,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from jaxface._types import Float
 
@@ -76,11 +75,33 @@ def crop_face(
     pad = ((max(-y0, 0), max(y1 - height, 0)), (max(-x0, 0), max(x1 - width, 0)))
     padded = np.pad(inner, (*pad, (0, 0)), mode="edge").astype(np.float32)
     covered = np.pad(np.ones(inner.shape[:2], np.float32), pad)
-    box = (origin[0] - x0, origin[1] - y0, origin[0] - x0 + side, origin[1] - y0 + side)
+    start = origin - [x0, y0]
+    image = _resize(padded, start, side, size)
+    inside = _resize(covered[..., None], start, side, size)[..., 0]
+    return Crop(image, (inside > 0.99).astype(np.float32), origin, side)
 
-    def resize(channel: np.ndarray) -> np.ndarray:
-        picture = Image.fromarray(np.ascontiguousarray(channel), mode=None)
-        return np.asarray(picture.resize((size, size), Image.Resampling.HAMMING, box=box))
 
-    image = np.stack([resize(padded[..., c]) for c in range(3)], axis=-1)
-    return Crop(image, (resize(covered) > 0.99).astype(np.float32), origin, side)
+def _resize(
+    image: Float[np.ndarray, "h w c"], start: np.ndarray, side: float, size: int
+) -> Float[np.ndarray, "size size c"]:
+    """Square of ``side`` pixels at ``start`` (x, y), resampled by a triangle filter."""
+    # Whole blocks are averaged first, so that the matrices below stay small for large photos.
+    block = max(int(side / size) // 2, 1)
+    if block > 1:
+        rows, columns = (n // block * block for n in image.shape[:2])
+        grid = image[:rows, :columns].reshape(rows // block, block, columns // block, block, -1)
+        image, start, side = grid.mean(axis=(1, 3)), start / block, side / block
+    down = _weights(image.shape[0], start[1], side, size)
+    across = _weights(image.shape[1], start[0], side, size)
+    height, width, channels = image.shape
+    lines = (down @ image.reshape(height, -1)).reshape(size, width, channels)
+    return np.einsum("sw,rwc->rsc", across, lines, optimize=True)
+
+
+def _weights(count: int, start: float, side: float, size: int) -> np.ndarray:
+    """(size, count) rows that average ``count`` pixels into ``size``; each sums to one."""
+    scale = side / size
+    centres = start + (np.arange(size) + 0.5) * scale
+    offset = np.arange(count) + 0.5 - centres[:, None]
+    weights = np.maximum(1 - np.abs(offset) / max(scale, 1.0), 0.0)
+    return (weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)).astype(np.float32)

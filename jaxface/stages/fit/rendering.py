@@ -10,7 +10,7 @@ from jaxface.models.parameters import FaceParameters
 from jaxface.render.interpolate import interpolate
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import irradiance
-from jaxface.stages.fit_model import FitModel
+from jaxface.stages.fit.prepared import FitModel
 
 
 class FitRender(eqx.Module):

@@ -33,8 +33,8 @@ from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import sh_basis
 from jaxface.solvers.gauss_newton import Problem, gauss_newton
-from jaxface.stages.fit_model import FitModel
-from jaxface.stages.inliers import inlier_weights
+from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.inliers import inlier_weights
 
 
 class FitWeights(eqx.Module):
@@ -130,7 +130,7 @@ def _geometric_terms(weights: FitWeights) -> list[Term]:
     ]
 
 
-def fit_input_to_parameters(
+def fit_parameters(
     data: FitInput,
     models: tuple[FitModel, ...],
     weights: FitWeights,

@@ -1,0 +1,33 @@
+"""Photo -> fitted face (Saito 2017, section 3)."""
+
+from jaxface.stages.fit.photo import WorkingPhoto, working_photo
+from jaxface.stages.fit.posterior import Posterior, posterior
+from jaxface.stages.fit.prepared import FitModel, prepare
+from jaxface.stages.fit.rendering import FitRender, render_fit
+from jaxface.stages.fit.solve import (
+    FitConfig,
+    FitData,
+    FitInput,
+    FitStats,
+    FitWeights,
+    fit_energy,
+    fit_parameters,
+)
+
+__all__ = [
+    "FitConfig",
+    "FitData",
+    "FitInput",
+    "FitModel",
+    "FitRender",
+    "FitStats",
+    "FitWeights",
+    "Posterior",
+    "WorkingPhoto",
+    "fit_energy",
+    "fit_parameters",
+    "posterior",
+    "prepare",
+    "render_fit",
+    "working_photo",
+]

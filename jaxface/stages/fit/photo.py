@@ -1,0 +1,97 @@
+"""From a photo and its landmarks to the input of a fit, on the host."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Float
+from jaxface.imaging.crop import Crop, crop_face
+from jaxface.imaging.masks import face_oval_mask
+from jaxface.stages.fit.solve import FitInput
+
+OUTER_EYE_CORNERS = {68: (36, 45), 468: (33, 263)}
+DEFAULT_FOCAL = 1.4
+"""focal length over the photo's longer side if the file does not tell: a 50 mm lens at 35 mm"""
+
+
+class WorkingPhoto(NamedTuple):
+    """The fit's input and how it was cut out of the photo.
+
+    Attributes:
+        data: input of the fit.
+        crop: where the working image lies in the photo.
+        gain: the working image is ``gain`` times the photo's linear light.
+    """
+
+    data: FitInput
+    crop: Crop
+    gain: float
+
+
+def working_photo(
+    photo: Float[np.ndarray, "h w 3"],
+    landmarks: Float[np.ndarray, "l 2"],
+    *,
+    mask: Float[np.ndarray, "h w"] | None = None,
+    focal: float | None = None,
+    size: int = 512,
+) -> WorkingPhoto:
+    """Cut the face out of a photo and bring it to the fit's scale and exposure.
+
+    Exposure is divided out (median of the face's pixels to 0.5), because the weight of the photo
+    term is absolute; the fitted light is in units of the working image.
+
+    Args:
+        photo: linear RGB.
+        landmarks: (x, y) px: 68 iBUG or 468 MediaPipe points.
+        mask: valid face pixels of the photo, trusted as it is; by default the face oval, in
+            which hair, hands and glasses are then looked for.
+        focal: focal length in px, if known; else a normal lens is the weak prior.
+        size: side of the working image, a multiple of 4.
+
+    Raises:
+        ValueError: wrong number of landmarks, or a photo, mask or landmarks that do not fit.
+    """
+    points = np.asarray(landmarks, np.float64)[:, :2]
+    if len(points) not in OUTER_EYE_CORNERS:
+        raise ValueError(f"{len(points)} landmarks; 68 (iBUG) or 468 (MediaPipe) are needed")
+    height, width = photo.shape[:2]
+    crop = crop_face(photo, points, size)
+    inside = crop.to_crop(points)
+    if mask is None:
+        valid = np.asarray(face_oval_mask(jnp.asarray(inside * size, jnp.float32), size, size))
+    else:
+        if mask.shape != (height, width):
+            raise ValueError(f"the mask is {mask.shape}, but the photo is {(height, width)}")
+        shown = np.repeat(np.asarray(mask, np.float32)[..., None], 3, axis=-1)
+        valid = crop_face(shown, points, size).image[..., 0]
+    valid = valid * crop.inside
+    if (valid > 0.5).sum() < 200:
+        raise ValueError(
+            "the mask leaves fewer than 200 pixels of the face; a mask that is white on skin is "
+            "needed"
+        )
+    level = float(np.median(crop.image[valid > 0.5]))
+    if not level > 1e-5:
+        raise ValueError("the face is black: there is no light in the photo to fit")
+    left, right = OUTER_EYE_CORNERS[len(points)]
+    focal_side = (focal if focal is not None else DEFAULT_FOCAL * max(height, width)) / crop.side
+    centre = crop.to_crop(np.array([width / 2, height / 2]))
+    gain = 0.5 / level
+
+    def array(value):
+        return jnp.asarray(value, jnp.result_type(float))
+
+    data = FitInput(
+        image=array(crop.image * gain),
+        mask=array(valid),
+        landmarks=array(inside),
+        landmark_weight=array(np.ones(len(points))),
+        landmark_unit=array(np.linalg.norm(inside[left] - inside[right])),
+        principal=array(centre),
+        log_focal=array(np.log(focal_side)),
+        log_focal_deviation=array(0.05 if focal is not None else 0.3),
+        estimate_inliers=jnp.asarray(mask is None),
+    )
+    return WorkingPhoto(data, crop, gain)
