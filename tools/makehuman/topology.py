@@ -13,8 +13,10 @@ from makehuman.source import BaseMesh
 
 NECK_RINGS = 4
 CAVITY_RINGS = 3
-# Polar angles (degrees) of the eyeball's rings: pupil edge at 10-12.5, limbus at 25.5-28.5.
-EYE_RINGS = (5.5, 10.0, 12.5, 19.0, 25.0, 28.5, 38.0, 52.0, 68.0, 86.0)
+# Polar angles (degrees) of the eyeball's rings. MakeHuman's eyeballs are a third too big, so that
+# a pupil of 2 mm and a limbus of 6 mm radius lie at 7 and 20 degrees.
+EYE_RINGS = (3.5, 6.0, 8.0, 13.0, 18.0, 21.5, 30.0, 44.0, 63.0, 86.0)
+PUPIL_ANGLE, LIMBUS_ANGLE = 7.0, 20.0
 EYE_SEGMENTS = 12
 INTERIOR = ("mouth_cavity", "helper-upper-teeth", "helper-lower-teeth", "helper-tongue")
 
@@ -73,20 +75,25 @@ def eyeball(base: BaseMesh, group: str) -> tuple[sparse.csr_matrix, np.ndarray, 
     stretch = radius / np.linalg.norm(chord @ base.vertices - centre, axis=1)
     mean_row = np.full(len(members), 1 / len(members))
     mean = sparse.csr_matrix(
-        (np.tile(mean_row, len(rays)), (np.repeat(np.arange(len(rays)), len(members)),
-         np.tile(members, len(rays)))), shape)
+        (
+            np.tile(mean_row, len(rays)),
+            (np.repeat(np.arange(len(rays)), len(members)), np.tile(members, len(rays))),
+        ),
+        shape,
+    )
     linear = sparse.diags(stretch) @ chord + sparse.diags(1 - stretch) @ mean
 
     ring = 1 + np.arange(len(EYE_RINGS) * EYE_SEGMENTS).reshape(len(EYE_RINGS), EYE_SEGMENTS)
     following = np.roll(ring, -1, axis=1)
-    pole = np.stack([np.zeros(EYE_SEGMENTS, int), ring[0], following[0],
-                     np.full(EYE_SEGMENTS, -1)], axis=1)
+    pole = np.stack(
+        [np.zeros(EYE_SEGMENTS, int), ring[0], following[0], np.full(EYE_SEGMENTS, -1)], axis=1
+    )
     bands = np.stack([ring[:-1], ring[1:], following[1:], following[:-1]], axis=-1)
     return linear.tocsr(), np.concatenate([pole, bands.reshape(-1, 4)]), np.degrees(theta)
 
 
 def cut_head(base: BaseMesh) -> HeadMesh:
-    """Head, a piece of neck, lids' inner rings, mouth bag, teeth, tongue and new eyeballs."""
+    """Head, a capped piece of neck, lids' inner rings, mouth, teeth, tongue and new eyeballs."""
     group = base.group.copy()
     head = group == "head"
     neck = grow(base.quads, head, group == "body", NECK_RINGS)
@@ -107,9 +114,12 @@ def cut_head(base: BaseMesh) -> HeadMesh:
         part[quads[kept_group == name]] = name
         uv_part[uv_quads[kept_group == name]] = name
 
-    rows = [sparse.csr_matrix(
-        (np.ones(len(members)), (np.arange(len(members)), members)),
-        (len(members), len(base.vertices)))]
+    rows = [
+        sparse.csr_matrix(
+            (np.ones(len(members)), (np.arange(len(members)), members)),
+            (len(members), len(base.vertices)),
+        )
+    ]
     angles = [np.full(len(members), np.nan)]
     parts, uv_parts, all_quads, all_uv_quads = [part], [uv_part], [quads], [uv_quads]
     uvs = [base.uv[uv_members]]
@@ -126,11 +136,52 @@ def cut_head(base: BaseMesh) -> HeadMesh:
         all_quads.append(np.where(eye_quads < 0, -1, eye_quads + count))
         all_uv_quads.append(np.where(eye_quads < 0, -1, eye_quads + uv_count))
         count, uv_count = count + len(angle), uv_count + len(angle)
+    loop = boundary_loop(quads, np.isin(part, ["neck"]))
+    size = len(loop)
+    rows.append(
+        sparse.csr_matrix(
+            (np.full(size, 1 / size), (np.zeros(size, int), members[loop])), (1, len(base.vertices))
+        )
+    )
+    angles.append(np.full(1, np.nan))
+    parts.append(np.array(["neck_cap"], "U32"))
+    turn = np.arange(size) * 2 * np.pi / size
+    uvs.append(np.concatenate([[[0.0, 0.0]], np.stack([np.sin(turn), np.cos(turn)], axis=1)]))
+    uv_parts.append(np.full(size + 1, "neck_cap", "U32"))
+    steps = np.arange(size)
+    fan = np.stack([np.roll(steps, -1), steps, np.full(size, -1)], axis=1)
+    all_quads.append(
+        np.column_stack([np.full(size, count), loop[fan[:, 0]], loop[fan[:, 1]], fan[:, 2]])
+    )
+    all_uv_quads.append(
+        np.column_stack([np.full(size, uv_count), uv_count + 1 + fan[:, :2], fan[:, 2]])
+    )
     return HeadMesh(
-        sparse.vstack(rows).tocsr(), np.concatenate(all_quads), np.concatenate(uvs),
-        np.concatenate(all_uv_quads), np.concatenate(parts), np.concatenate(uv_parts),
+        sparse.vstack(rows).tocsr(),
+        np.concatenate(all_quads),
+        np.concatenate(uvs),
+        np.concatenate(all_uv_quads),
+        np.concatenate(parts),
+        np.concatenate(uv_parts),
         np.concatenate(angles),
     )
+
+
+def boundary_loop(quads: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The one boundary loop whose vertices are all in the mask ``among``, along its faces' sense.
+
+    Raises:
+        ValueError: those boundary edges form no single closed loop.
+    """
+    edges = np.concatenate([quads[:, [k, (k + 1) % 4]] for k in range(4)])
+    directed = {(a, b) for a, b in edges.tolist()}
+    border = {a: b for a, b in directed if (b, a) not in directed and among[a] and among[b]}
+    loop = [next(iter(sorted(border)))]
+    while border.get(loop[-1], loop[0]) != loop[0]:
+        loop.append(border[loop[-1]])
+    if len(loop) != len(border):
+        raise ValueError(f"{len(border)} boundary edges, but a loop of {len(loop)}")
+    return np.array(loop)
 
 
 def triangulate(quads: np.ndarray) -> np.ndarray:
