@@ -27,7 +27,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     # Most of the time of a run is spent compiling; XLA's results are kept between runs.
-    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jaxface-xla")))
+    if hasattr(config, "cache"):  # absent under -p no:cacheprovider
+        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jaxface-xla")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
