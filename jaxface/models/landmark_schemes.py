@@ -91,10 +91,11 @@ MEDIAPIPE_TO_IBUG68_WEIGHTS = np.array([(share, 1 - share) for _, _, share in _P
 """(68, 2) the weight of each of the two"""
 
 
-def landmarks68(points: Float[Array, "468 d"]) -> Float[Array, "68 d"]:
+def landmarks68(points: Float[Array | np.ndarray, "468 d"]) -> Float[Array, "68 d"]:
     """The 68 iBUG points of a face mesh: fixed blends of two mesh points each.
 
     The 17 of the jaw come from the mesh's own outline, not from the visible silhouette.
     """
-    pairs = points[MEDIAPIPE_TO_IBUG68]
-    return jnp.einsum("lpd,lp->ld", pairs, jnp.asarray(MEDIAPIPE_TO_IBUG68_WEIGHTS, points.dtype))
+    points = jnp.asarray(points)
+    weights = jnp.asarray(MEDIAPIPE_TO_IBUG68_WEIGHTS, points.dtype)
+    return jnp.einsum("lpd,lp->ld", points[MEDIAPIPE_TO_IBUG68], weights)

@@ -222,7 +222,7 @@ def _landmarks(
     if turns:
         turned = Region(local.centre, local.side, local.angle + np.float32(turns * np.pi / 2))
         points, presence, _ = _settle(nets.mesh, patch, turned)
-    landmarks = (points + np.append(corner, 0)) * factor
+    landmarks = ((points + np.append(corner, 0)) * factor).astype(np.float32)
     low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
     return DetectedFace(np.concatenate([low, high]), scores[turns], landmarks, presence)
 
