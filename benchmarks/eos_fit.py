@@ -4,8 +4,8 @@ Both get the bundled model (base mesh, all identity and expression modes, the sa
 same 68 points: those the model itself projects to (exact), or those plus noise of 1% of the
 distance between the outer eye corners. eos solves for an orthographic camera by alternating linear
 least squares, five rounds, with its own contour search for the jaw. Ours solves for a perspective
-camera by Gauss-Newton; it also starts from the field of view of 53 degrees, which is in no scene. The shape error is the median distance over the face
-region after a similarity transform.
+camera by Gauss-Newton, from a field of view of 28 degrees (the scenes have 15 to 40). The shape
+error is the median distance over the face region after a similarity transform.
 
     python benchmarks/eos_fit.py
 """
