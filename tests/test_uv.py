@@ -61,7 +61,8 @@ def test_texels_belong_to_the_triangle_that_holds_them(seed):
 
 
 def test_orientation_row_zero_at_the_top():
-    layout = uv_layout(np.array([[0, 0.5], [0.5, 1], [0, 1.0]]), np.array([[0, 1, 2]]), 16, gutter=0)
+    corners = np.array([[0, 0.5], [0.5, 1], [0, 1.0]])
+    layout = uv_layout(corners, np.array([[0, 1, 2]]), 16, gutter=0)
     inside = np.asarray(layout.inside)
     assert inside[0, 0] and inside[:8, :8].sum() == inside.sum() > 20
     assert layout.area[0] == pytest.approx(0.125 * 256)
