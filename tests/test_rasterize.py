@@ -1,11 +1,18 @@
-"""The rasteriser against a brute-force float64 loop, and its derivatives."""
+"""The rasteriser against a brute-force float64 loop, its rules, and its derivatives."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from jaxface.render.rasterize import rasterize
+from jaxface.geometry.camera import Camera, Pose
+from jaxface.render import zbuffer
+from jaxface.render.coverage import TILE_COLUMNS, TILE_ROWS, pixel_block, tile_bits
+from jaxface.render.image import render
+from jaxface.render.interpolate import interpolate
+from jaxface.render.rasterize import barycentrics, rasterize
 
 HEIGHT, WIDTH = 45, 61
 
@@ -109,3 +116,266 @@ def test_equals_brute_force_in_single_precision_away_from_ties(seed):
     assert clear.mean() > 0.97
     np.testing.assert_array_equal(np.asarray(got.triangle)[clear], ids[clear])
     np.testing.assert_allclose(np.asarray(got.depth)[clear], depth[clear], rtol=1e-3)
+
+
+def test_batches_smaller_than_a_triangle_change_nothing(monkeypatch):
+    screen, faces = scene(11)
+    whole = rasterize(jnp.asarray(screen, jnp.float32), jnp.asarray(faces), HEIGHT, WIDTH)
+    for batch in (7, 100):
+        monkeypatch.setattr(zbuffer, "BATCH", batch)
+        zbuffer.nearest_triangles.clear_cache()
+        parts = rasterize(jnp.asarray(screen, jnp.float32), jnp.asarray(faces), HEIGHT, WIDTH)
+        np.testing.assert_array_equal(parts.triangle, whole.triangle)
+    monkeypatch.undo()
+    zbuffer.nearest_triangles.clear_cache()
+
+
+def cover_counts(x, y, faces, rows, columns):
+    """How many triangles own each pixel centre, from the coverage test itself."""
+    x, y = (tuple(v[faces[:, i]] for i in range(3)) for v in (x, y))
+    counts = np.zeros((rows * TILE_ROWS, columns * TILE_COLUMNS), int)
+    for r in range(rows):
+        for c in range(columns):
+            left = jnp.full(len(faces), c * TILE_COLUMNS, jnp.int32)
+            top = jnp.full(len(faces), r * TILE_ROWS, jnp.int32)
+            full = jnp.full(len(faces), 99, jnp.int32)
+            bits = np.asarray(tile_bits(x, y, left, top, full, full, cull=False))
+            tile = (bits[:, None] >> np.arange(TILE_ROWS * TILE_COLUMNS)) & 1
+            counts[
+                r * TILE_ROWS : (r + 1) * TILE_ROWS, c * TILE_COLUMNS : (c + 1) * TILE_COLUMNS
+            ] = tile.sum(axis=0).reshape(TILE_ROWS, TILE_COLUMNS)
+    return counts
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**31 - 1),
+    lattice=st.sampled_from([0.5, 0.25, 0.1, 1e-3, 0.0]),
+    mirror=st.booleans(),
+)
+def test_every_centre_inside_a_mesh_has_exactly_one_owner(seed, lattice, mirror):
+    rng = np.random.default_rng(seed)
+    n = 9
+    grid_x, grid_y = np.meshgrid(np.linspace(-1, 13, n), np.linspace(-1, 11, n))
+    jitter = rng.uniform(-0.6, 0.6, (2, n, n))
+    jitter[:, [0, -1]] = 0
+    jitter[:, :, [0, -1]] = 0
+    x, y = grid_x + jitter[0], grid_y + jitter[1]
+    if lattice:
+        # A lattice through the pixel centres puts centres on edges and on vertices.
+        x, y = np.round(x / lattice) * lattice, np.round(y / lattice) * lattice
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    slash = rng.random(a.shape) < 0.5
+    one = np.where(slash[..., None], np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+    two = np.where(slash[..., None], np.stack([b, d, c], -1), np.stack([a, d, c], -1))
+    faces = np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
+    faces = faces[:, ::-1] if mirror else faces
+    x, y = (jnp.asarray(v.reshape(-1), jnp.float32) for v in (x, y))
+    # Jitter may fold a cell over itself: count turned triangles as taken away.
+    px, py = np.asarray(x, np.float64)[faces], np.asarray(y, np.float64)[faces]
+    area = (px[:, 1] - px[:, 0]) * (py[:, 2] - py[:, 0]) - (py[:, 1] - py[:, 0]) * (
+        px[:, 2] - px[:, 0]
+    )
+    turned = (area < 0) != mirror
+    counts = cover_counts(x, y, faces[~turned & (area != 0)], 2, 2)
+    if turned.any():
+        counts -= cover_counts(x, y, faces[turned & (area != 0)], 2, 2)
+    assert (counts == 1).all()
+
+
+def test_equal_depths_go_to_the_lowest_index():
+    screen, faces = scene(3)
+    faces = np.concatenate([faces, faces])
+    got = rasterize(jnp.asarray(screen, jnp.float32), jnp.asarray(faces), HEIGHT, WIDTH)
+    assert int(got.triangle.max()) < len(faces) // 2
+
+
+def padded(screen, faces, count=60):
+    """The same scene in the shapes of the others, so that it is not compiled again."""
+    screen = np.pad(np.asarray(screen, np.float32), ((0, 3 * count - len(screen)), (0, 0)))
+    faces = np.pad(np.asarray(faces), ((0, count - len(faces)), (0, 0)))
+    return jnp.asarray(screen), jnp.asarray(faces)
+
+
+def test_dropped_triangles():
+    square = [[-5.0, -5, 400], [90, -5, 400], [-5, 90, 400], [90, 90, 50]]
+    square, faces = padded(square, [[0, 2, 1], [1, 2, 3]])
+    whole = rasterize(square, faces, HEIGHT, WIDTH)
+    assert bool(whole.mask.all())
+    near = rasterize(square, faces, HEIGHT, WIDTH, near=50.0)
+    assert not bool((near.triangle == 1).any())
+    behind = rasterize(square.at[3, 2].set(-1.0), faces, HEIGHT, WIDTH)
+    np.testing.assert_array_equal(behind.triangle, near.triangle)
+    assert bool(jnp.isinf(near.depth[~near.mask]).all())
+    assert float(jnp.abs(near.barycentric[~near.mask]).max()) == 0
+    front = rasterize(square, faces, HEIGHT, WIDTH, cull=True)
+    back = rasterize(square, faces[:, ::-1], HEIGHT, WIDTH, cull=True)
+    assert bool(front.mask.all()) and not bool(back.mask.any())
+
+
+def test_culling_keeps_what_faces_the_camera():
+    # Counter-clockwise seen from +z, before a camera that looks along -z.
+    triangle = jnp.array([[-50.0, -50, -400], [50, -50, -400], [0, 50, -400]])
+    camera = Camera.from_field_of_view(30.0, HEIGHT, WIDTH)
+    screen, faces = padded(camera.project(triangle), [[0, 1, 2]])
+    assert bool(rasterize(screen, faces, HEIGHT, WIDTH, cull=True).mask.any())
+    assert not bool(rasterize(screen, faces[:, ::-1], HEIGHT, WIDTH, cull=True).mask.any())
+
+
+def test_empty_meshes_and_wrong_arguments():
+    screen, faces = jnp.zeros((4, 3)), jnp.zeros((0, 3), jnp.int32)
+    got = rasterize(screen, faces, HEIGHT, WIDTH)
+    assert not bool(got.mask.any()) and bool(jnp.isinf(got.depth).all())
+    with pytest.raises(ValueError, match="height and width"):
+        rasterize(screen, faces, 0, WIDTH)
+    with pytest.raises(ValueError, match="screen has shape"):
+        rasterize(screen[:, :2], faces, HEIGHT, WIDTH)
+    with pytest.raises(ValueError, match="faces has shape"):
+        rasterize(screen, faces[:, :2], HEIGHT, WIDTH)
+
+
+def test_block_of_pixels_survives_coordinates_beyond_integers():
+    x, y = [jnp.array([v, 3.0]) for v in (-1e30, 4.2, 1e30)], [jnp.array([v]) for v in (0.0, 9, 1)]
+    left, top, columns, rows = pixel_block(tuple(x), tuple(y), jnp.array([True]), 20, 30)
+    assert (int(left[0]), int(columns[0]), int(top[0]), int(rows[0])) == (0, 30, 0, 9)
+
+
+def test_vmap_equals_a_loop():
+    scenes = [scene(seed) for seed in (20, 21, 22)]
+    screens = jnp.stack([jnp.asarray(s, jnp.float32) for s, _ in scenes])
+    faces = jnp.stack([jnp.asarray(f) for _, f in scenes])
+
+    def draw(screen, faces):
+        return rasterize(screen, faces, HEIGHT, WIDTH)
+
+    def check(got, pick_screen, pick_faces):
+        for i in range(3):
+            alone = draw(pick_screen(i), pick_faces(i))
+            np.testing.assert_array_equal(got.triangle[i], alone.triangle)
+            np.testing.assert_allclose(got.depth[i], alone.depth, rtol=1e-5)
+
+    check(jax.vmap(draw)(screens, faces), lambda i: screens[i], lambda i: faces[i])
+    shared = jax.jit(jax.vmap(draw, in_axes=(0, None)))(screens, faces[0])
+    check(shared, lambda i: screens[i], lambda i: faces[0])
+    nested = jax.vmap(jax.vmap(draw, in_axes=(None, 0)), in_axes=(0, None))(screens, faces)
+    assert nested.triangle.shape == (3, 3, HEIGHT, WIDTH)
+    np.testing.assert_array_equal(nested.triangle[1, 2], draw(screens[1], faces[2]).triangle)
+
+
+def test_weights_interpolate_in_perspective():
+    camera = Camera.from_field_of_view(60.0, HEIGHT, WIDTH)
+    points = jnp.array([[-90.0, -80, -150], [110, -70, -420], [0, 120, -900]])
+    faces = jnp.array([[0, 1, 2]])
+    fragments = rasterize(*padded(camera.project(points), faces), HEIGHT, WIDTH)
+    assert int(fragments.mask.sum()) > 200
+    # The interpolated point must project to the centre of the pixel that shows it.
+    seen = interpolate(points, faces, fragments)[fragments.mask]
+    y, x = jnp.nonzero(fragments.mask)
+    projected = camera.project(seen)
+    np.testing.assert_allclose(projected[:, 0], x + 0.5, atol=1e-3)
+    np.testing.assert_allclose(projected[:, 1], y + 0.5, atol=1e-3)
+    np.testing.assert_allclose(projected[:, 2], fragments.depth[fragments.mask], rtol=1e-5)
+    np.testing.assert_allclose(fragments.barycentric.sum(-1)[fragments.mask], 1.0, atol=1e-6)
+
+
+def head():
+    """A bumpy closed surface of 320 triangles, millimetres, with a colour at each vertex."""
+    trimesh = pytest.importorskip("trimesh")
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    rng = np.random.default_rng(0)
+    vertices = np.asarray(sphere.vertices) * [70.0, 95.0, 80.0] + rng.normal(0, 1.5, (162, 3))
+    return vertices, np.asarray(sphere.faces), rng.uniform(0.2, 0.9, (162, 3))
+
+
+PARTS = ("vertices", "albedo", "pose", "camera", "light")
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """The inputs of a picture by name, and its derivative in a direction by three routes."""
+    with jax.enable_x64(True):
+        vertices, faces, albedo = head()
+        rng = np.random.default_rng(1)
+        inputs = {
+            "vertices": jnp.asarray(vertices),
+            "albedo": jnp.asarray(albedo),
+            "pose": Pose(jnp.array([0.1, 0.4, -0.05]), jnp.array([4.0, -3.0, -600.0])),
+            "camera": Camera(jnp.asarray(120.0), jnp.array([31.0, 22.0])),
+            "light": jnp.asarray(rng.normal(0, 0.3, (9, 3))).at[0].add(2.5),
+        }
+        weights = jnp.asarray(rng.normal(size=(HEIGHT, WIDTH, 3)))
+
+        def draw(values):
+            return render(**values, faces=jnp.asarray(faces), height=HEIGHT, width=WIDTH)
+
+        def loss(values, fixed):
+            return jnp.sum(jnp.where(fixed[..., None], weights * draw(values).color, 0.0))
+
+        @jax.jit
+        def derivatives(step, h):
+            ahead, behind = (
+                draw(jax.tree.map(lambda v, s: v + sign * h * s, inputs, step)) for sign in (1, -1)
+            )
+            fixed = (ahead.fragments.triangle == behind.fragments.triangle) & ahead.mask
+            color = jnp.where(fixed[..., None], weights * (ahead.color - behind.color), 0.0)
+            _, forward = jax.jvp(lambda v: loss(v, fixed), (inputs,), (step,))
+            gradient = jax.grad(loss)(inputs, fixed)
+            reverse = sum(
+                jnp.sum(g * s)
+                for g, s in zip(jax.tree.leaves(gradient), jax.tree.leaves(step), strict=True)
+            )
+            return jnp.sum(fixed), jnp.sum(color) / (2 * h), forward, reverse
+
+    return inputs, derivatives
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_derivatives_of_the_picture_equal_differences(part, picture):
+    inputs, derivatives = picture
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(2)
+        size = {"camera": 0.3, "pose": 0.01}.get(part, 1.0)
+        step = {
+            name: jax.tree.map(
+                lambda v, on=name == part: jnp.asarray(size * on * rng.normal(size=v.shape)), value
+            )
+            for name, value in inputs.items()
+        }
+        fixed, difference, forward, reverse = map(float, derivatives(step, 1e-5))
+    assert fixed > 400
+    scale = abs(difference) + 1e-3
+    assert abs(forward - reverse) < 1e-9 * scale
+    assert abs(forward - difference) < 1e-5 * scale
+
+
+def test_derivative_of_depth_equals_differences():
+    with jax.enable_x64(True):
+        screen, faces = (jnp.asarray(a) for a in scene(5))
+        screen = jnp.where(jnp.isfinite(screen), screen, 0.0)
+        step = jnp.asarray(np.random.default_rng(3).normal(size=screen.shape))
+        h = 1e-6
+        draw = jax.jit(lambda s: rasterize(s, faces, HEIGHT, WIDTH))
+        ahead, behind = draw(screen + h * step), draw(screen - h * step)
+        here, tangent = jax.jvp(lambda s: draw(s).depth, (screen,), (step,))
+        fixed = (ahead.triangle == behind.triangle) & jnp.isfinite(here)
+        difference = (ahead.depth - behind.depth) / (2 * h)
+        np.testing.assert_allclose(tangent[fixed], difference[fixed], rtol=1e-4, atol=1e-3)
+
+
+def test_no_nan_at_degenerate_triangles():
+    screen, faces = scene(6)
+    screen = jnp.asarray(np.where(np.isfinite(screen), screen, 0.0), jnp.float32)
+    # Also ask for triangles that do not cover their pixel, or cover none at all.
+    everywhere = jnp.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % len(faces)
+    everywhere = everywhere.at[0].set(-1)
+    weights, tangent = jax.jvp(
+        lambda s: barycentrics(s, jnp.asarray(faces), everywhere), (screen,), (screen,)
+    )
+    gradient = jax.grad(lambda s: barycentrics(s, jnp.asarray(faces), everywhere)[..., 0].sum())
+    drawn = jax.grad(
+        lambda s: jnp.sum(rasterize(s, jnp.asarray(faces), HEIGHT, WIDTH).barycentric[..., 1])
+    )
+    for array in (weights, tangent, gradient(screen), drawn(screen)):
+        assert bool(jnp.isfinite(array).all())
+    assert float(jnp.abs(weights[0]).max()) == 0

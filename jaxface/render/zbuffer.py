@@ -65,7 +65,7 @@ class Buffer(NamedTuple):
     triangle: Int[Array, "p"]
 
 
-@partial(jax.jit, static_argnames=("height", "width", "cull", "near"))
+@partial(jax.jit, static_argnames=("height", "width", "cull"))
 def nearest_triangles(
     screen: Float[Array, "b n 3"],
     faces: Int[Array, "b f 3"],
