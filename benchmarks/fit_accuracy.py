@@ -18,8 +18,9 @@ import jax
 import numpy as np
 import typer
 from fit_metrics import Estimate, compare, face_region, load_truth, sphere
+from ground_truth import model_digest
 from harness import RESULTS, provenance
-from photo_fit import PhotoFitter
+from photo_fit import fit_photo
 from PIL import Image
 
 from jaxface.io.drawing import draw_landmarks
@@ -104,7 +105,7 @@ def main(
     model: Annotated[str, typer.Option(help="the model that the faces were drawn from")] = (
         "makehuman"
     ),
-    levels: Annotated[str, typer.Option(help="subdivision on each pyramid level")] = "0,1,2",
+    details: Annotated[str, typer.Option(help="subdivision on each level, e.g. 0,1,2")] = "",
     only: Annotated[str, typer.Option(help="of the photos, those whose name has this")] = "",
     output: Annotated[Path, typer.Option(help="folder of the results")] = RESULTS,
     sheet: Annotated[Path | None, typer.Option(help="contact sheet (PNG) to write")] = None,
@@ -115,16 +116,17 @@ def main(
     if not stems:
         raise typer.BadParameter(f"{folder} has no renders; make some with ground_truth.py")
     source = load_model(model)
-    fitter = PhotoFitter(source, tuple(int(level) for level in levels.split(",")))
+    finest = tuple(int(level) for level in details.split(",")) if details else None
     truth_model = subdivide(source, matching_level(source, len(load_truth(stems[0])["albedo"])))
+    digest = model_digest(truth_model)
     region = face_region(truth_model)
     rows, panels = [], []
     for stem in stems:
         truth = load_truth(stem)
-        if str(truth["model"]) != source.name:
-            raise typer.BadParameter(f"{stem} is a face of {truth['model']}, not {source.name}")
+        if str(truth["digest"]) != digest:
+            raise typer.BadParameter(f"{stem} is a face of another {truth['model']}; render anew")
         photo = np.asarray(Image.open(stem.with_suffix(".png")).convert("RGB"))
-        estimate = fitter(photo)
+        estimate = fit_photo(photo, source, finest)
         figures = compare(estimate, truth, truth_model, region)
         facts = {
             "name": stem.stem,
@@ -141,7 +143,7 @@ def main(
     origin = provenance(["jax", "jaxlib", "numpy", "optimistix", "equinox"])
     report = {
         "model": source.name,
-        "levels": levels,
+        "details": details or "default",
         "region_vertices": len(region),
         "provenance": origin,
         "photos": rows,

@@ -7,6 +7,7 @@ with mitsuba under a distant light (shadows and bounces included) and writes for
     python benchmarks/ground_truth.py --model makehuman --out /tmp/ground_truth
 """
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -115,6 +116,15 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.round(255 * encoded).astype(np.uint8)
 
 
+def model_digest(model: MorphableModel) -> str:
+    """Fingerprint of a model's geometry: coefficients mean the same face only where it agrees."""
+    arrays = (model.mean, model.identity.basis, model.expression.basis, model.faces)
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area-weighted unit vertex normals (n, 3)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -203,6 +213,7 @@ def photograph(
     single = {k: np.asarray(v, np.float32) for k, v in truth.items()}
     names = {
         "model": subject.model.name,
+        "digest": model_digest(subject.model),
         "light_name": light_name,
         "backdrop": kind,
         "yaw": yaw,
