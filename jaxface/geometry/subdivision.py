@@ -73,7 +73,7 @@ def _matrix(
 ) -> sparse.csr_matrix:
     """Sum of (rows, columns, values) entries."""
     rows, columns, values = (np.concatenate(x) for x in zip(*entries, strict=True))
-    matrix = sparse.coo_matrix((values, (rows, columns)), shape).tocsr()
+    matrix = sparse.csr_matrix((values, (rows, columns)), shape)
     matrix.sum_duplicates()
     return matrix
 
@@ -160,7 +160,7 @@ def catmull_clark(quads: Int[np.ndarray, "q 4"], vertex_count: int) -> Refinemen
     border = sparse.csr_matrix((border_entries[2], border_entries[:2]), (vertex_count,) * 2)
     vertex_point = around @ face_point + neighbours + stay + border
 
-    matrix = sparse.vstack([vertex_point, edge_point, face_point]).tocsr()
+    matrix = sparse.csr_matrix(sparse.vstack([vertex_point, edge_point, face_point]))
     matrix.eliminate_zeros()
     refined = np.stack(
         [
@@ -171,9 +171,9 @@ def catmull_clark(quads: Int[np.ndarray, "q 4"], vertex_count: int) -> Refinemen
         ],
         axis=1,
     )
-    linear = sparse.vstack(
-        [sparse.identity(vertex_count), _midpoints(edges, vertex_count), face_point]
-    ).tocsr()
+    linear = sparse.csr_matrix(
+        sparse.vstack([sparse.identity(vertex_count), _midpoints(edges, vertex_count), face_point])
+    )
     return Refinement(matrix, linear, refined, face)
 
 
@@ -231,4 +231,6 @@ def loop(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Refinement:
     ).reshape(-1, 3)
     refined = np.concatenate([triangles, np.full((len(triangles), 1), -1)], axis=1)
     linear = sparse.vstack([sparse.identity(vertex_count), _midpoints(edges, vertex_count)])
-    return Refinement(matrix, linear.tocsr(), refined, np.repeat(np.arange(len(faces)), 4))
+    return Refinement(
+        matrix, sparse.csr_matrix(linear), refined, np.repeat(np.arange(len(faces)), 4)
+    )

@@ -38,7 +38,7 @@ def load_bundled(name: str = "makehuman") -> MorphableModel:
         ValueError: no bundled model has that name.
     """
     entry = resources.files("jaxface") / "assets" / f"{name}.npz"
-    if not entry.is_file():
+    if not name.isidentifier() or not entry.is_file():
         raise ValueError(f"no bundled model {name!r}; the package has {bundled_models()}")
     with resources.as_file(entry) as path:
         return load_model(path)
@@ -115,40 +115,40 @@ def load_model(path: str | os.PathLike) -> MorphableModel:
     arrays = _read_arrays(path)
     metadata = _metadata(arrays, path)
     _validate(arrays, metadata, path)
-    bases = {
-        name: LinearBasis(
-            jnp.asarray(arrays[f"{name}_steps"] * arrays[f"{name}_scale"], jnp.float32),
-            jnp.asarray(arrays[f"{name}_std"], jnp.float32),
+
+    def basis(name: str) -> LinearBasis:
+        columns = arrays[f"{name}_steps"] * arrays[f"{name}_scale"]
+        return LinearBasis(
+            jnp.asarray(columns, jnp.float32), jnp.asarray(arrays[f"{name}_std"], jnp.float32)
         )
-        for name in _BASES
-    }
-    points = {
-        name: SurfacePoints(
+
+    def points(name: str) -> SurfacePoints | None:
+        if f"{name}_vertices" not in arrays:
+            return None
+        return SurfacePoints(
             jnp.asarray(arrays[f"{name}_vertices"], jnp.int32),
             jnp.asarray(arrays[f"{name}_weights"], jnp.float32),
         )
-        if f"{name}_vertices" in arrays
-        else None
-        for name in _LANDMARKS
-    }
-    quads = {
-        name: jnp.asarray(arrays[name], jnp.int32) if name in arrays else None
-        for name in ("quads", "uv_quads")
-    }
+
+    has_quads = "quads" in arrays
     return MorphableModel(
         mean=jnp.asarray(arrays["mean"], jnp.float32),
+        identity=basis("identity"),
+        expression=basis("expression"),
         albedo_mean=jnp.asarray(arrays["albedo_mean"], jnp.float32),
+        albedo=basis("albedo"),
         faces=jnp.asarray(arrays["faces"], jnp.int32),
         uv=jnp.asarray(arrays["uv"], jnp.float32),
         uv_faces=jnp.asarray(arrays["uv_faces"], jnp.int32),
+        landmarks68=points("landmarks68"),
+        landmarks468=points("landmarks468"),
         region=jnp.asarray(arrays["region"], jnp.int32),
         name=metadata["name"],
         region_names=tuple(metadata["region_names"]),
         expression_names=tuple(metadata["expression_names"]),
         licence=metadata["licence"],
-        **bases,
-        **points,
-        **quads,
+        quads=jnp.asarray(arrays["quads"], jnp.int32) if has_quads else None,
+        uv_quads=jnp.asarray(arrays["uv_quads"], jnp.int32) if has_quads else None,
     )
 
 
@@ -156,7 +156,7 @@ def _quantise(basis: np.ndarray, finest: float) -> tuple[np.ndarray, np.ndarray]
     """int16 steps (n, 3, k) and the size of a step in each column (k,) float32."""
     if not np.isfinite(basis).all():
         raise ValueError("a basis to be saved has non-finite values")
-    largest = np.abs(basis).reshape(-1, basis.shape[-1]).max(0, initial=0.0)
+    largest = np.abs(basis).max((0, 1), initial=0.0)
     scale = np.maximum(largest / 32767, finest).astype(np.float32)
     return np.round(basis / scale.astype(np.float64)).clip(-32767, 32767).astype(np.int16), scale
 
@@ -166,7 +166,9 @@ def _read_arrays(path: str | os.PathLike, only: str | None = None) -> dict[str, 
     if not path.is_file():
         raise FileNotFoundError(f"no model file {str(path)!r}")
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here, for NumPy leaves a file open when its zip directory is broken.
+        with open(path, "rb") as stream:
+            stored = np.load(stream, allow_pickle=False)
             if not isinstance(stored, np.lib.npyio.NpzFile):
                 raise ValueError("it is a single array, not an .npz")
             names = stored.files if only is None else [only] if only in stored.files else []

@@ -48,10 +48,11 @@ def _refine_once(model: MorphableModel) -> MorphableModel:
         refined, refined_uv = loop(coarse, count), loop(coarse_uv, len(model.uv))
         remap = _on_refined_triangles
     matrix = refined.matrix.astype(np.float32)
+    refined_count = refined.matrix.get_shape()[0]
 
     def apply(values: np.ndarray) -> np.ndarray:
         flat = np.asarray(values, np.float32).reshape(count, int(np.prod(values.shape[1:])))
-        return (matrix @ flat).reshape(matrix.shape[0], *values.shape[1:])
+        return (matrix @ flat).reshape(refined_count, *values.shape[1:])
 
     def apply_basis(basis: LinearBasis) -> LinearBasis:
         return LinearBasis(jnp.asarray(apply(np.asarray(basis.basis))), basis.std)
