@@ -138,9 +138,7 @@ def photometric_jacobian(
     harmonics = sh_basis(n)
     eye = jnp.eye(3, dtype=n.dtype)
     j_light = jnp.einsum("pc,pj,cd->pcjd", a, harmonics, eye).reshape(*a.shape, 27)
-    jacobian = jnp.concatenate(
-        [j_shape, j_albedo, j_light, j_rotation, slope, j_focal], axis=-1
-    )
+    jacobian = jnp.concatenate([j_shape, j_albedo, j_light, j_rotation, slope, j_focal], axis=-1)
     return a * shading, jacobian
 
 

@@ -74,7 +74,9 @@ def similarity_transform(
     mean_target = w @ target
     x, y = source - mean_source, target - mean_target
     u, singular, vt = jnp.linalg.svd((w[:, None] * y).T @ x)
-    sign = jnp.array([1.0, 1.0, 1.0], source.dtype).at[2].set(jnp.linalg.det(u) * jnp.linalg.det(vt))
+    sign = (
+        jnp.array([1.0, 1.0, 1.0], source.dtype).at[2].set(jnp.linalg.det(u) * jnp.linalg.det(vt))
+    )
     rotation = (u * sign) @ vt
     variance = jnp.sum(w[:, None] * x * x)
     scale = jnp.sum(singular * sign) / variance if with_scale else jnp.ones((), source.dtype)
@@ -88,9 +90,7 @@ def euler_yxz(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """
     m = matrix
     pitch = jnp.arcsin(jnp.clip(-m[1, 2], -1.0, 1.0))
-    return jnp.stack(
-        [jnp.arctan2(m[0, 2], m[2, 2]), pitch, jnp.arctan2(m[1, 0], m[1, 1])]
-    )
+    return jnp.stack([jnp.arctan2(m[0, 2], m[2, 2]), pitch, jnp.arctan2(m[1, 0], m[1, 1])])
 
 
 rotation_matrices = jax.vmap(rotation_matrix)

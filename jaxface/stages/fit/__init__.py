@@ -1,9 +1,10 @@
 """Photo -> fitted face (Saito 2017, section 3)."""
 
+from jaxface.stages.fit.batch import fit_batch
 from jaxface.stages.fit.photo import WorkingPhoto, working_photo
 from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
-from jaxface.stages.fit.rendering import FitRender, render_fit
+from jaxface.stages.fit.rendering import FitRender, render_fit, skin_map
 from jaxface.stages.fit.solve import (
     FitConfig,
     FitData,
@@ -24,10 +25,12 @@ __all__ = [
     "FitWeights",
     "Posterior",
     "WorkingPhoto",
+    "fit_batch",
     "fit_energy",
     "fit_parameters",
     "posterior",
     "prepare",
     "render_fit",
+    "skin_map",
     "working_photo",
 ]

@@ -7,8 +7,8 @@ from jaxface._types import Array, Float
 from jaxface.energies.photometric_quadratic import normal_modes, shape_basis
 from jaxface.models.parameters import FaceParameters
 from jaxface.solvers.gauss_newton import posterior_covariance
-from jaxface.stages.fit.solve import FitConfig, FitInput, FitWeights, fit_energy, observe
 from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.solve import FitConfig, FitInput, FitWeights, fit_energy, observe
 
 
 class Posterior(eqx.Module):

@@ -25,7 +25,6 @@ MEDIAPIPE_CONTOUR = (
 """the face oval among the 468 points"""
 
 
-
 class FitModel(eqx.Module):
     """A morphable model with the tables that the fit gathers through."""
 

@@ -3,13 +3,16 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from jaxface._types import Array, Bool, Float, Int
+from jaxface._types import Array, Bool, Float
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
+from jaxface.imaging.masks import smoothstep
+from jaxface.imaging.resample import resize
 from jaxface.models.parameters import FaceParameters
 from jaxface.render.interpolate import interpolate
-from jaxface.render.rasterize import rasterize
+from jaxface.render.rasterize import Fragments, rasterize
 from jaxface.render.shading import irradiance
+from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.prepared import FitModel
 
 
@@ -21,7 +24,7 @@ class FitRender(eqx.Module):
     albedo: Float[Array, "s s 3"]
     normal: Float[Array, "s s 3"]
     """unit, camera frame; zero on the background"""
-    triangle: Int[Array, "s s"]
+    fragments: Fragments
     skin: Bool[Array, "s s"]
     """pixels whose triangle the photo term compares"""
 
@@ -42,8 +45,28 @@ def render_fit(
     normal = at_pixel[..., :3] @ rotation.T
     normal = normal / jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     covered = fragments.triangle >= 0
-    color = jnp.where(
-        covered[..., None], at_pixel[..., 3:] * irradiance(normal, y.light), 0.0
-    )
+    color = jnp.where(covered[..., None], at_pixel[..., 3:] * irradiance(normal, y.light), 0.0)
     skin = covered & model.face_mask[jnp.maximum(fragments.triangle, 0)]
-    return FitRender(color, at_pixel[..., 3:], normal, fragments.triangle, skin)
+    return FitRender(color, at_pixel[..., 3:], normal, fragments, skin)
+
+
+def skin_map(
+    rendered: FitRender, image: Float[Array, "s s 3"], mask: Float[Array, "s s"]
+) -> Float[Array, "s s"]:
+    """Pixels that show skin as the fit explains it: mask, less hair, hands and glasses.
+
+    The inlier weights of the fit on the rendered working image, averaged over 4x4 pixels and
+    steepened, so that the map has smooth borders and no single-pixel holes.
+    """
+    size = image.shape[0]
+    weight = (mask * rendered.skin).reshape(-1)
+    inlier = inlier_weights(image.reshape(-1, 3), rendered.color.reshape(-1, 3), weight)
+    valid = (mask * rendered.skin)[..., None]
+    shares = resize(
+        jnp.concatenate([inlier.reshape(size, size, 1) * valid, valid], axis=-1),
+        size // 4,
+        size // 4,
+    )
+    smooth = resize(shares, size, size)
+    share = smooth[..., 0] / jnp.maximum(smooth[..., 1], 1e-6)
+    return smoothstep(share, 0.35, 0.65) * mask * rendered.skin

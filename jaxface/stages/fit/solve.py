@@ -33,8 +33,8 @@ from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import sh_basis
 from jaxface.solvers.gauss_newton import Problem, gauss_newton
-from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.inliers import inlier_weights
+from jaxface.stages.fit.prepared import FitModel
 
 
 class FitWeights(eqx.Module):

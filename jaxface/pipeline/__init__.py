@@ -1,0 +1,26 @@
+"""One photo through all stages; the only place that sequences them.
+
+Each step is a function of its own and can be replaced: give landmarks, a mask, a model or terms
+of your own, or call the stages yourself.
+"""
+
+from jaxface.pipeline.clock import Clock
+from jaxface.pipeline.fitting import FittedFace, as_photo, detail_levels, fit
+from jaxface.pipeline.journeys import digitize, digitize_folder, open_photo, photos_in
+from jaxface.pipeline.saving import save_fit
+from jaxface.pipeline.texturing import Texture, texture
+
+__all__ = [
+    "Clock",
+    "FittedFace",
+    "Texture",
+    "as_photo",
+    "detail_levels",
+    "digitize",
+    "digitize_folder",
+    "fit",
+    "open_photo",
+    "photos_in",
+    "save_fit",
+    "texture",
+]

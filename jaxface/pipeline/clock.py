@@ -1,0 +1,50 @@
+"""Times of a run, with compilation apart."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import PyTree
+
+
+@dataclass
+class Clock:
+    """Seconds of every step, compilation apart."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    compiling: dict[str, float] = field(default_factory=dict)
+
+    def run(self, name: str, program: Any, *args: PyTree) -> Any:
+        """Call a jitted function and wait for it; its compilation is timed on its own."""
+        start = time.perf_counter()
+        compiled = _compiled(program, *args)
+        ready = time.perf_counter()
+        answer = jax.block_until_ready(compiled(*args))
+        self.compiling[name] = self.compiling.get(name, 0.0) + ready - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - ready
+        return answer
+
+    def host(self, name: str, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        """Call a function of the host and time it."""
+        start = time.perf_counter()
+        answer = function(*args, **options)
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        return answer
+
+
+_PROGRAMS: dict[Any, Any] = {}
+
+
+def _compiled(program: Any, *args: PyTree) -> Any:
+    """The compiled program for arguments of these shapes, made once a process."""
+    leaves, structure = jax.tree.flatten(args)
+    shapes = tuple((np.shape(x), jnp.result_type(x), np.ndim(x)) for x in leaves)
+    key = (program, structure, shapes)
+    if key not in _PROGRAMS:
+        _PROGRAMS[key] = program.lower(*args).compile()
+    return _PROGRAMS[key]

@@ -1,0 +1,268 @@
+"""Photo -> fitted face: landmarks, model, crop and fit in sequence."""
+
+import functools
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Array, Float
+from jaxface.energies.term import Term
+from jaxface.imaging.colour import srgb_to_linear
+from jaxface.io.image import Photo, read_image
+from jaxface.io.models import load_model
+from jaxface.models.landmark_schemes import landmarks68
+from jaxface.models.morphable import MorphableModel
+from jaxface.models.parameters import FaceParameters
+from jaxface.models.subdivide import subdivide
+from jaxface.pipeline.clock import Clock
+from jaxface.stages.fit import (
+    FitConfig,
+    FitModel,
+    FitRender,
+    FitStats,
+    FitWeights,
+    Posterior,
+    WorkingPhoto,
+    fit_parameters,
+    posterior,
+    prepare,
+    render_fit,
+    skin_map,
+    working_photo,
+)
+from jaxface.stages.landmarks import detect_one
+
+SUBDIVIDED_BELOW = 20_000
+"""models with fewer vertices are refined once for the finer pyramid levels"""
+
+
+_fit_program = jax.jit(fit_parameters)
+_posterior_program = jax.jit(posterior)
+_skin_program = jax.jit(skin_map)
+
+
+@dataclass(frozen=True)
+class FittedFace:
+    """A photo, the model, and what the fit found."""
+
+    photo: Float[np.ndarray, "h w 3"]
+    """linear RGB"""
+    working: WorkingPhoto
+    landmarks: Float[np.ndarray, "l 2"]
+    """detected or given, px of the photo"""
+    models: tuple[FitModel, ...]
+    """level of detail for each pyramid level; the last is the finest"""
+    parameters: FaceParameters
+    stats: FitStats
+    posterior: Posterior
+    clock: Clock
+
+    @property
+    def model(self) -> MorphableModel:
+        """The finest level of detail."""
+        return self.models[-1].model
+
+    @property
+    def vertices(self) -> Float[Array, "n 3"]:
+        """Fitted shape in the model's frame, mm."""
+        return self.model.shape(self.parameters.identity, self.parameters.expression)
+
+    @property
+    def size(self) -> int:
+        """Side of the working image, px."""
+        return self.working.data.image.shape[0]
+
+    @property
+    def fitted_landmarks(self) -> Float[np.ndarray, "l 2"]:
+        """Where the fitted mesh has the landmarks, px of the photo (contours not slid)."""
+        y, data = self.parameters, self.working.data
+        posed = y.pose(self.models[-1].points(self.vertices))
+        return self.working.crop.to_photo(
+            np.asarray(y.camera(data.principal).project(posed)[:, :2])
+        )
+
+    def landmark_error(self) -> float:
+        """Mean distance over the inner 51 of the 68 points, as a share of the outer eye corners'
+        distance.
+        """
+        found, fitted = self.landmarks, self.fitted_landmarks
+        if len(found) == 468:
+            found, fitted = (
+                np.asarray(landmarks68(jnp.asarray(p, jnp.float32))) for p in (found, fitted)
+            )
+        distance = np.linalg.norm(found[17:] - fitted[17:], axis=1).mean()
+        return float(distance / np.linalg.norm(found[36] - found[45]))
+
+    def render(self) -> FitRender:
+        """Render the fit as the working image sees it."""
+        program = _render_program(self.size)
+        principal = self.working.data.principal
+        return self.clock.run("render", program, self.parameters, self.models[-1], principal)
+
+    def skin_map(self) -> Float[np.ndarray, "s s"]:
+        """Pixels of the working image that show skin, 0 to 1: less hair, hands and glasses."""
+        data = self.working.data
+        if not bool(data.estimate_inliers):
+            return np.asarray(data.mask)
+        return np.asarray(
+            self.clock.run("skin", _skin_program, self.render(), data.image, data.mask)
+        )
+
+
+@functools.cache
+def _render_program(size: int) -> Any:
+    return jax.jit(lambda y, model, principal: render_fit(y, model, principal, size))
+
+
+def detail_levels(
+    model: MorphableModel, landmark_count: int, levels: int, details: Sequence[int] | None = None
+) -> tuple[FitModel, ...]:
+    """The model prepared for each pyramid level, coarsest first.
+
+    Args:
+        model: any morphable model.
+        landmark_count: 68 or 468.
+        levels: pyramid levels.
+        details: how often the model is subdivided at each level; by default never at the
+            coarsest, and once at the others if it has fewer than ``SUBDIVIDED_BELOW`` vertices.
+
+    Raises:
+        ValueError: ``details`` does not have one entry a level, or it decreases.
+    """
+    if details is None:
+        finer = int(model.vertex_count < SUBDIVIDED_BELOW)
+        details = [0] + [finer] * (levels - 1)
+    if len(details) != levels or list(details) != sorted(details) or min(details) < 0:
+        raise ValueError(
+            f"details is {list(details)}; {levels} subdivision counts, not decreasing, are needed"
+        )
+    prepared: dict[int, FitModel] = {}
+    current, done = model, 0
+    for detail in details:
+        if detail > done:
+            current, done = subdivide(current, detail - done), detail
+        if detail not in prepared:
+            prepared[detail] = prepare(current, landmark_count)
+    return tuple(prepared[detail] for detail in details)
+
+
+def parse_weights(text: str) -> FitWeights:
+    """Weights from text such as ``landmark=20,prior=1e-5``; the others stay the paper's.
+
+    Raises:
+        ValueError: an unknown term, or a value that is not a finite number of 0 or more.
+    """
+    values = {}
+    names = tuple(FitWeights.__dataclass_fields__)
+    for part in text.split(","):
+        name, _, number = (piece.strip() for piece in part.partition("="))
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if name not in names or not (np.isfinite(value) and value >= 0):
+            raise ValueError(
+                f"weights has {part.strip()!r}; NAME=NUMBER is needed, the names being "
+                f"{', '.join(names)} and the numbers 0 or more"
+            )
+        values[name] = value
+    return FitWeights(**values)
+
+
+def as_photo(photo: str | os.PathLike[str] | Photo | np.ndarray) -> Photo:
+    """A photo from a file or an array (``uint8`` or sRGB-encoded floats in [0, 1]).
+
+    Raises:
+        ValueError: an array that is not (h, w, 3) of one of these kinds, or has NaN.
+        FileNotFoundError: there is no such file.
+    """
+    if isinstance(photo, Photo):
+        return photo
+    if not isinstance(photo, np.ndarray):
+        return read_image(photo)
+    if photo.ndim != 3 or photo.shape[2] != 3:
+        raise ValueError(f"the photo has shape {photo.shape}; (height, width, 3) RGB is needed")
+    if photo.dtype == np.uint8:
+        pixels = photo.astype(np.float32) / 255
+    elif np.issubdtype(photo.dtype, np.floating):
+        pixels = photo.astype(np.float32)
+        if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() > 1:
+            raise ValueError("a photo of floats needs finite sRGB-encoded values from 0 to 1")
+    else:
+        raise ValueError(f"the photo is {photo.dtype}; uint8 or floats in [0, 1] are needed")
+    return Photo(pixels, None, None, "array")
+
+
+def fit(
+    photo: str | os.PathLike[str] | Photo | np.ndarray,
+    model: str | os.PathLike[str] | MorphableModel = "makehuman",
+    *,
+    landmarks: Float[np.ndarray, "l 2"] | None = None,
+    mask: Float[np.ndarray, "h w"] | None = None,
+    face: int | None = None,
+    detector: Callable[..., Any] = detect_one,
+    weights: FitWeights | None = None,
+    steps: Sequence[int] = (30, 10, 3),
+    size: int = 512,
+    details: Sequence[int] | None = None,
+    extra_terms: Sequence[Term] = (),
+    clock: Clock | None = None,
+) -> FittedFace:
+    """Fit a morphable model to a photo (Saito 2017, section 3).
+
+    Args:
+        photo: file, or (h, w, 3) array, ``uint8`` or sRGB-encoded floats.
+        model: bundled name, model file, or model.
+        landmarks: 68 or 468 points, px; detected if not given.
+        mask: (h, w) valid face pixels; by default the face oval less what is not skin.
+        face: which face, from the largest (0), where the photo shows several.
+        detector: ``detector(pixels, face)`` with an answer that has ``landmarks`` (468, 2 or 3).
+        weights: of the terms; the paper's by default.
+        steps: Gauss-Newton steps on each pyramid level, coarsest first.
+        size: side of the working image, px.
+        details: subdivisions of the model at each level (``detail_levels``).
+        extra_terms: your own terms, functions of ``(FaceParameters, FitData)``.
+        clock: where times are noted.
+
+    Raises:
+        ValueError: no face, several faces, or an argument that does not fit; the message says
+            which.
+        FileNotFoundError: a file that does not exist.
+    """
+    clock = clock or Clock()
+    if not steps or min(steps) < 0 or size % 2 ** (len(steps) - 1) or size < 64:
+        raise ValueError(
+            f"steps {tuple(steps)} at size {size}: needed one or more non-negative counts and a "
+            f"size of 64 or more that halves {max(len(steps) - 1, 0)} times"
+        )
+    seen = clock.host("read photo", as_photo, photo)
+    if not isinstance(model, MorphableModel):
+        model = clock.host("load model", load_model, model)
+    if landmarks is None:
+        found = clock.host("detect landmarks", detector, seen.pixels, face)
+        landmarks = np.asarray(found.landmarks)[:, :2]
+        if model.landmarks468 is None:
+            landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
+    landmarks = np.asarray(landmarks, np.float64)[:, :2]
+    models = clock.host("prepare model", detail_levels, model, len(landmarks), len(steps), details)
+    linear = np.asarray(srgb_to_linear(seen.pixels))
+    focal = None
+    if seen.focal_35mm:
+        focal = seen.focal_35mm / 36.0 * max(linear.shape[:2])
+    working = clock.host(
+        "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
+    )
+    weights = weights or FitWeights()
+    config = FitConfig(steps=tuple(steps), extra_terms=tuple(extra_terms))
+    parameters, stats = clock.run("fit", _fit_program, working.data, models, weights, config)
+    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
+        raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
+    spread = clock.run(
+        "posterior", _posterior_program, parameters, working.data, models[-1], weights, config
+    )
+    return FittedFace(linear, working, landmarks, models, parameters, stats, spread, clock)
