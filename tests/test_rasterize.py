@@ -306,26 +306,31 @@ def picture():
         }
         weights = jnp.asarray(rng.normal(size=(HEIGHT, WIDTH, 3)))
 
+        @jax.jit
         def draw(values):
             return render(**values, faces=jnp.asarray(faces), height=HEIGHT, width=WIDTH)
+
+        def moved(step, h):
+            return draw(jax.tree.map(lambda v, s: v + h * s, inputs, step))
 
         def loss(values, fixed):
             return jnp.sum(jnp.where(fixed[..., None], weights * draw(values).color, 0.0))
 
-        @jax.jit
+        along = jax.jit(
+            lambda step, fixed: jax.jvp(lambda v: loss(v, fixed), (inputs,), (step,))[1]
+        )
+        slope = jax.jit(jax.grad(loss))
+
         def derivatives(step, h):
-            ahead, behind = (
-                draw(jax.tree.map(lambda v, s: v + sign * h * s, inputs, step)) for sign in (1, -1)
-            )
+            ahead, behind = moved(step, h), moved(step, -h)
             fixed = (ahead.fragments.triangle == behind.fragments.triangle) & ahead.mask
             color = jnp.where(fixed[..., None], weights * (ahead.color - behind.color), 0.0)
-            _, forward = jax.jvp(lambda v: loss(v, fixed), (inputs,), (step,))
-            gradient = jax.grad(loss)(inputs, fixed)
+            gradient = slope(inputs, fixed)
             reverse = sum(
                 jnp.sum(g * s)
                 for g, s in zip(jax.tree.leaves(gradient), jax.tree.leaves(step), strict=True)
             )
-            return jnp.sum(fixed), jnp.sum(color) / (2 * h), forward, reverse
+            return jnp.sum(fixed), jnp.sum(color) / (2 * h), along(step, fixed)[1], reverse
 
     return inputs, derivatives
 

@@ -90,9 +90,7 @@ def vertex_neighbours(
     return _padded_table(directed[:, 0], directed[:, 1], vertex_count)
 
 
-def incident_faces(
-    faces: NpInt[np.ndarray, "f 3"], vertex_count: int
-) -> NpInt[np.ndarray, "n v"]:
+def incident_faces(faces: NpInt[np.ndarray, "f 3"], vertex_count: int) -> NpInt[np.ndarray, "n v"]:
     """Triangles around each vertex, ascending, padded with -1."""
     faces = np.asarray(faces)
     return _padded_table(faces.reshape(-1), np.repeat(np.arange(len(faces)), 3), vertex_count)

@@ -78,21 +78,16 @@ def nearest_triangles(
     scenes, count = faces.shape[:2]
     x, y, z = (
         tuple(
-            jax.vmap(lambda v, i: v[i])(screen[..., k], faces[..., i]).reshape(-1)
-            for i in range(3)
+            jax.vmap(lambda v, i: v[i])(screen[..., k], faces[..., i]).reshape(-1) for i in range(3)
         )
         for k in range(3)
     )
     finite = jnp.isfinite(sum(x)) & jnp.isfinite(sum(y)) & jnp.isfinite(sum(z))
     drawable = finite & (z[0] > near) & (z[1] > near) & (z[2] > near)
     triangle = jnp.arange(scenes * count, dtype=jnp.int32)
-    tiles = Tiles(
-        x, y, z, *pixel_block(x, y, drawable, height, width), triangle // count, triangle
-    )
+    tiles = Tiles(x, y, z, *pixel_block(x, y, drawable, height, width), triangle // count, triangle)
     pixels = scenes * height * width
-    buffer = Buffer(
-        jnp.full((pixels,), jnp.inf, x[0].dtype), jnp.full((pixels,), NONE, jnp.int32)
-    )
+    buffer = Buffer(jnp.full((pixels,), jnp.inf, x[0].dtype), jnp.full((pixels,), NONE, jnp.int32))
     buffer, rest = _draw(buffer, tiles, _bits(tiles, cull), ROUNDS, height, width)
 
     # Few-fragment tiles first: a batch takes as many rounds as its fullest tile.
