@@ -63,6 +63,7 @@ def test_transparency_is_kept_and_laid_over_grey(tmp_path):
     photo = saved(tmp_path, "a.png", Image.fromarray(np.concatenate([BYTES, alpha], axis=2)))
     np.testing.assert_allclose(photo.pixels[:, :10], 0.5)
     np.testing.assert_allclose(photo.pixels[:, 10:], BYTES[:, 10:] / 255, atol=1e-6)
+    assert photo.opacity is not None
     np.testing.assert_allclose(photo.opacity, alpha[..., 0] / 255)
     solid = np.full_like(alpha, 255)
     photo = saved(tmp_path, "b.png", Image.fromarray(np.concatenate([BYTES, solid], axis=2)))

@@ -210,37 +210,38 @@ def _landmarks(
     region = _first_region(*(jnp.asarray(x, jnp.float32) for x in (box, *keypoints[:2])))
     centre = (float(region.centre[0]), float(region.centre[1]))
     patch, corner, factor = photo.patch(centre, _REACH * float(region.side), _PATCH_SIZE)
+    image = _channels_last(patch)
     local = Region(region.centre / factor - corner, region.side / factor, region.angle)
-    points, presence, local = _settle(nets.mesh, patch, local)
+    points, presence, local = _settle(nets.mesh, image, local)
     # The mesh is sure of itself upside down and on blobs. A face seen level convinces the
     # detector, and more so than any other turn of it does.
-    level = _level_picture(patch, local)
+    level = _level_picture(image, local)
     scores = [_central_score(nets.detector, level)]
     if scores[0] < _SURE_SCORE:
         scores += [_central_score(nets.detector, np.rot90(level, turns)) for turns in (1, 2, 3)]
     turns = int(np.argmax(scores))
     if turns:
         turned = Region(local.centre, local.side, local.angle + np.float32(turns * np.pi / 2))
-        points, presence, _ = _settle(nets.mesh, patch, turned)
+        points, presence, _ = _settle(nets.mesh, image, turned)
     landmarks = ((points + np.append(corner, 0)) * factor).astype(np.float32)
     low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
     return DetectedFace(np.concatenate([low, high]), scores[turns], landmarks, presence)
 
 
 def _settle(
-    mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
+    mesh: LandmarkNet, image: Float[Array, "p p 3"], region: Region
 ) -> tuple[np.ndarray, float, Region]:
     # Look until the region that the points give is the one they were found in. A detection's
     # region is rough, so the first look never counts. Then average over a few sizes of it.
-    _, _, region = _look(mesh, patch, region)
+    _, _, region = _look(mesh, image, region)
     for _ in range(_MAX_LOOKS - 1):
         before = region
-        points, presence, region = _look(mesh, patch, before)
+        points, presence, region = _look(mesh, image, before)
         shift = np.max(np.abs(np.asarray(region.centre) - np.asarray(before.centre)))
         if max(shift, abs(region.side - before.side)) < _STILL * region.side:
             break
     others = [
-        _look(mesh, patch, Region(before.centre, before.side * np.float32(k), before.angle))[0]
+        _look(mesh, image, Region(before.centre, before.side * np.float32(k), before.angle))[0]
         for k in _OTHER_SIZES
     ]
     return np.mean([points, *others], axis=0), float(presence), region
@@ -262,21 +263,26 @@ _first_region = jax.jit(region_from_eyes)
 
 
 @jax.jit
+def _channels_last(patch: Float[np.ndarray, "3 p p"]) -> Float[Array, "p p 3"]:
+    return jnp.moveaxis(patch, 0, -1)
+
+
+@jax.jit
 def _detect(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> Candidates:
     return detector(picture)
 
 
 @jax.jit
-def _level_picture(patch: Float[np.ndarray, "3 p p"], region: Region) -> Array:
+def _level_picture(image: Float[Array, "p p 3"], region: Region) -> Array:
     wider = Region(region.centre, region.side * _LEVEL_MARGIN, region.angle)
     size = 2 * DETECTOR_SIZE
-    return halve(affine_crop(jnp.moveaxis(patch, 0, -1), wider.transform(size), size, size))
+    return halve(affine_crop(image, wider.transform(size), size, size))
 
 
 @jax.jit
 def _look(
-    mesh: LandmarkNet, patch: Float[np.ndarray, "3 p p"], region: Region
+    mesh: LandmarkNet, image: Float[Array, "p p 3"], region: Region
 ) -> tuple[Float[Array, "468 3"], Float[Array, ""], Region]:
     # Points, presence, and the region to look at next.
-    landmarks, presence = symmetric_landmarks(mesh, jnp.moveaxis(patch, 0, -1), region)
+    landmarks, presence = symmetric_landmarks(mesh, image, region)
     return landmarks, presence, region_from_landmarks(landmarks)
