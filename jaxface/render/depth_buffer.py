@@ -8,6 +8,8 @@ import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.camera import Camera
+from jaxface.imaging.masks import feather
+from jaxface.imaging.mipmap import mipmap
 from jaxface.render.rasterize import rasterize
 
 # A surface seen steeper than this (tangent of the angle to the view) counts as a depth jump.
@@ -39,6 +41,20 @@ class DepthBuffer(eqx.Module):
     def _jumps(self, first: Array, second: Array) -> Array:
         nearer = jnp.minimum(first, second)
         return jnp.abs(first - second) * self.camera.focal > _STEEPEST * nearer
+
+    def clear_of_contours(
+        self, height: int, width: int, feather_width: float
+    ) -> Float[Array, "height width"]:
+        """How surely each pixel of the photo shows one surface alone.
+
+        0 at contours, 1 from ``feather_width`` px of the photo (at least one of the buffer) away.
+        """
+        clear = feather(~self.contours(), max(1.0, feather_width * self.scale))
+        if clear.shape == (height, width):
+            return clear
+        x, y = ((jnp.arange(n) + 0.5) * self.scale for n in (width, height))
+        points = jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        return mipmap(clear[..., None], 1).bilinear(points).reshape(height, width)
 
     def unoccluded(
         self, points: Float[Array, "n 3"], face_normals: Float[Array, "n 3"]

@@ -19,7 +19,7 @@ from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.masks import feather, smoothstep
 from jaxface.imaging.mipmap import mipmap
 from jaxface.imaging.push_pull import push_pull
-from jaxface.render.depth_buffer import DepthBuffer, depth_buffer
+from jaxface.render.depth_buffer import depth_buffer
 from jaxface.render.shading import irradiance, sh_basis
 
 
@@ -108,7 +108,8 @@ def _unwrap(
 ) -> PartialAlbedo:
     height, width = photo.shape[:2]
     buffer = depth_buffer(vertices, faces, camera, height, width, depth_size)
-    alpha = _confidence(mask, buffer, feather_width).astype(photo.dtype)
+    inside = feather(jnp.pad(mask > 0, 1), feather_width)[1:-1, 1:-1] * mask
+    alpha = (inside * buffer.clear_of_contours(height, width, feather_width)).astype(photo.dtype)
     pyramid = mipmap(jnp.concatenate([photo * alpha[..., None], alpha[..., None]], axis=-1))
 
     normals = vertex_normals(vertices, faces)
@@ -156,18 +157,6 @@ def _unwrap(
 
 def _dot(a: Array, b: Array) -> Array:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
-
-
-def _confidence(mask: Array, buffer: DepthBuffer, feather_width: float) -> Array:
-    """How far each pixel shows one surface inside the mask: 0 at its edge and contours, then 1."""
-    height, width = mask.shape
-    inside = feather(jnp.pad(mask > 0, 1), feather_width)[1:-1, 1:-1]
-    clear = feather(~buffer.contours(), max(1.0, feather_width * buffer.scale))
-    if clear.shape != mask.shape:
-        x, y = ((jnp.arange(n) + 0.5) * buffer.scale for n in (width, height))
-        points = jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        clear = mipmap(clear[..., None], 1).bilinear(points).reshape(height, width)
-    return inside * mask * clear
 
 
 def _triangles(
