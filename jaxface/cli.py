@@ -26,7 +26,8 @@ _console = Console(stderr=True)
 PhotoArgument = Annotated[str, typer.Argument(help="Photo, folder of photos, or `demo`.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write into.")]
 ModelOption = Annotated[
-    str, typer.Option("--model", help="Bundled name or model file (.npz .mat .h5 .pkl .bin, folder).")
+    str,
+    typer.Option("--model", help="Bundled name or model file (.npz .mat .h5 .pkl .bin, folder)."),
 ]
 LandmarksOption = Annotated[
     Path | None,
@@ -36,7 +37,8 @@ MaskOption = Annotated[
     Path | None, typer.Option("--mask", help="Image of the photo's size, white on face skin.")
 ]
 FaceOption = Annotated[
-    int | None, typer.Option("--face", help="Which face, from the largest (0), if there are several.")
+    int | None,
+    typer.Option("--face", help="Which face, from the largest (0), if there are several."),
 ]
 LevelsOption = Annotated[
     str, typer.Option("--levels", help="Steps on each pyramid level, coarsest first.")
@@ -44,7 +46,8 @@ LevelsOption = Annotated[
 WeightsOption = Annotated[
     str | None,
     typer.Option(
-        "--weights", help="Term weights that differ from the paper's, as photo=1,landmark=10,prior=2.5e-5."
+        "--weights",
+        help="Term weights that differ from the paper's, as photo=1,landmark=10,prior=2.5e-5.",
     ),
 ]
 SizeOption = Annotated[int, typer.Option("--size", help="Side of the working image, px.")]
@@ -52,7 +55,9 @@ DetailsOption = Annotated[
     str | None,
     typer.Option("--details", help="Subdivisions of the model at each level, as 0,1,2."),
 ]
-ResolutionOption = Annotated[int, typer.Option("--resolution", help="Texels along a texture's side.")]
+ResolutionOption = Annotated[
+    int, typer.Option("--resolution", help="Texels along a texture's side.")
+]
 
 
 @app.command()

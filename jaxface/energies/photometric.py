@@ -88,7 +88,11 @@ def thin_samples(samples: PixelSamples, capacity: int) -> PixelSamples:
     count = rank[-1] + 1
     slot = jnp.where(count > capacity, (rank * (capacity / count)).astype(jnp.int32), rank)
     slot = jnp.where(valid, slot, capacity)
-    index = jnp.zeros(capacity, jnp.int32).at[slot].set(jnp.arange(len(valid)), mode="drop")
+    index = (
+        jnp.zeros(capacity, jnp.int32)
+        .at[slot]
+        .set(jnp.arange(len(valid), dtype=jnp.int32), mode="drop")
+    )
     used = jnp.arange(capacity) < count
     return PixelSamples(
         position=samples.position[index],

@@ -123,8 +123,10 @@ def sum_of_squares(tree: PyTree) -> Float[Array, ""]:
 
 
 def quadratic_by_autodiff(term: Term) -> Callable[[PyTree, PyTree], Quadratic]:
-    """Second-order model of a term: Gauss-Newton for residuals (forward mode), half the exact
-    Hessian for scalars (which may be indefinite: a solver has to damp it).
+    """Second-order model of a term by automatic differentiation.
+
+    Gauss-Newton for residuals (forward mode); half the exact Hessian for scalars, which may be
+    indefinite: a solver has to damp it.
     """
 
     def model(y: PyTree, args: PyTree) -> Quadratic:

@@ -19,7 +19,7 @@ from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.clock import Clock
+from jaxface.pipeline.clock import Clock, quick_compilation
 from jaxface.stages.fit import (
     FitConfig,
     FitModel,
@@ -41,7 +41,6 @@ SUBDIVIDED_BELOW = 20_000
 """models with fewer vertices are refined once for the finer pyramid levels"""
 
 
-_fit_program = jax.jit(fit_parameters)
 _posterior_program = jax.jit(posterior)
 _skin_program = jax.jit(skin_map)
 
@@ -87,9 +86,7 @@ class FittedFace:
         )
 
     def landmark_error(self) -> float:
-        """Mean distance over the inner 51 of the 68 points, as a share of the outer eye corners'
-        distance.
-        """
+        """Mean distance over the inner 51 of the 68 points, over that of the outer eye corners."""
         found, fitted = self.landmarks, self.fitted_landmarks
         if len(found) == 468:
             found, fitted = (
@@ -112,6 +109,11 @@ class FittedFace:
         return np.asarray(
             self.clock.run("skin", _skin_program, self.render(), data.image, data.mask)
         )
+
+
+@functools.cache
+def _fit_program() -> Any:
+    return jax.jit(fit_parameters, compiler_options=quick_compilation())
 
 
 @functools.cache
@@ -259,10 +261,10 @@ def fit(
     )
     weights = weights or FitWeights()
     config = FitConfig(steps=tuple(steps), extra_terms=tuple(extra_terms))
-    parameters, stats = clock.run("fit", _fit_program, working.data, models, weights, config)
+    parameters, stats = clock.run("fit", _fit_program(), working.data, models, weights, config)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
     spread = clock.run(
-        "posterior", _posterior_program, parameters, working.data, models[-1], weights, config
+        "posterior", _posterior_program, stats.curvature, models[-1].model, weights.prior
     )
     return FittedFace(linear, working, landmarks, models, parameters, stats, spread, clock)

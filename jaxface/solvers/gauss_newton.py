@@ -40,6 +40,7 @@ class _State(eqx.Module):
     step: Array
     done: Array
     history: dict[str, Array]
+    curvature: Array
 
 
 class GaussNewton(optx.AbstractMinimiser):
@@ -56,7 +57,16 @@ class GaussNewton(optx.AbstractMinimiser):
     damping: float = 1e-3
     tries: int = 6
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+    def init(
+        self,
+        fn: Any,
+        y: PyTree,
+        args: PyTree,
+        options: dict[str, Any],
+        f_struct: Any,
+        aux_struct: Any,
+        tags: frozenset[object],
+    ) -> _State:
         """Start with the initial damping and an empty history."""
         steps = options["steps"]
         names = ["total", *jax.tree.leaves(options["names"])]
@@ -66,9 +76,18 @@ class GaussNewton(optx.AbstractMinimiser):
             step=jnp.asarray(0),
             done=jnp.asarray(steps == 0),
             history=dict.fromkeys(names, nan),
+            curvature=jnp.zeros((ravel_pytree(y)[0].size,) * 2, f_struct.dtype),
         )
 
-    def step(self, fn, y, args, options, state, tags):
+    def step(
+        self,
+        fn: Any,
+        y: PyTree,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+    ) -> tuple[PyTree, _State, Any]:
         """Build the quadratic model once and take the first damped step that descends."""
         problem = options["problem"]
         data = problem.refresh(y, args)
@@ -117,16 +136,40 @@ class GaussNewton(optx.AbstractMinimiser):
             step=state.step + 1,
             done=~accepted | small | (state.step + 1 >= options["steps"]),
             history=history,
+            curvature=curvature,
         )
         return unravel(new), state, parts
 
-    def terminate(self, fn, y, args, options, state, tags):
+    def terminate(
+        self,
+        fn: Any,
+        y: PyTree,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+    ) -> tuple[Array, Any]:
         """Stop at the last step, or when the energy no longer falls."""
         return state.done, optx.RESULTS.successful
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+    def postprocess(
+        self,
+        fn: Any,
+        y: PyTree,
+        aux: Any,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+        result: Any,
+    ) -> tuple[PyTree, Any, dict[str, Any]]:
         """Report the energies before each step and after the last."""
-        return y, aux, {"history": state.history, "damping": state.damping}
+        stats = {
+            "history": state.history,
+            "damping": state.damping,
+            "curvature": state.curvature,
+        }
+        return y, aux, stats
 
 
 def gauss_newton(
@@ -159,8 +202,10 @@ def gauss_newton(
         tries: attempts, with growing damping, before a step is given up.
 
     Returns:
-        ``stats``: ``num_steps``; ``history``, a dict of (steps + 1,) arrays with the total and each part's
-        value before every step and after the last, NaN where unused; ``damping``, the last factor.
+        ``stats``: ``num_steps``; ``history``, a dict of (steps + 1,) arrays with the total and each
+        part's value before every step and after the last, NaN where unused; ``damping``, the
+        last factor; ``curvature``, (p, p), that of the last step's quadratic model (zero if
+        there was none).
     """
 
     def fn(y, args):

@@ -4,11 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float
-from jaxface.energies.photometric_quadratic import normal_modes, shape_basis
-from jaxface.models.parameters import FaceParameters
+from jaxface.energies.photometric_quadratic import shape_basis
+from jaxface.models.morphable import MorphableModel
 from jaxface.solvers.gauss_newton import posterior_covariance
-from jaxface.stages.fit.prepared import FitModel
-from jaxface.stages.fit.solve import FitConfig, FitInput, FitWeights, fit_energy, observe
 
 
 class Posterior(eqx.Module):
@@ -21,13 +19,9 @@ class Posterior(eqx.Module):
 
 
 def posterior(
-    y: FaceParameters,
-    data: FitInput,
-    model: FitModel,
-    weights: FitWeights,
-    config: FitConfig,
+    curvature: Float[Array, "p p"], model: MorphableModel, prior_weight: float | Array
 ) -> Posterior:
-    """Laplace approximation at the fit (Gauss-Newton Hessian).
+    """Laplace approximation from the Gauss-Newton Hessian of a fit.
 
     The energy is read as ``E = -2 w_reg log p`` plus a constant: that temperature makes the prior
     term alone the standard normal density of the coefficients which it stands for. The model
@@ -35,21 +29,13 @@ def posterior(
     model.
 
     Args:
-        y: the fitted parameters.
-        data: the fit's input.
-        model: the finest level of detail.
-        weights: the term weights of the fit.
-        config: its settings.
+        curvature: of the weighted energy at the fit, ``FitStats.curvature``.
+        model: the level of detail whose vertices are asked for.
+        prior_weight: ``w_reg`` of the fit.
     """
-    modes = normal_modes(y, model.model, model.stencil)
-    observed = observe(
-        y, data.image, data.mask, data, model, modes, curvature_pixels=config.curvature_pixels
-    )
-    quadratic, _ = fit_energy(weights, config.extra_terms).quadratic(y, observed)
-    covariance = posterior_covariance(quadratic.curvature, 2 * weights.prior)
-    basis = shape_basis(model.model)
-    k = basis.shape[-1]
-    shape_covariance = covariance[:k, :k]
-    moved = jnp.einsum("nck,kl->ncl", basis, shape_covariance)
-    variance = jnp.einsum("ncl,ncl->n", moved, basis)
+    covariance = posterior_covariance(curvature, 2 * prior_weight)
+    basis = shape_basis(model)
+    count = basis.shape[-1]
+    spread = jnp.einsum("nck,kl->ncl", basis, covariance[:count, :count])
+    variance = jnp.einsum("ncl,ncl->n", spread, basis)
     return Posterior(covariance, jnp.sqrt(jnp.maximum(variance, 0.0)))

@@ -1,8 +1,8 @@
 """Fit a morphable model to one photo (Saito 2017, section 3, equation 1).
 
 ``E = w_c E_c + w_lan E_lan + w_reg E_reg`` over identity, expression, albedo, pose, camera and
-light, by damped Gauss-Newton on iteratively reweighted least squares over an image pyramid. Visibility
-is recomputed by the rasteriser before every step.
+light, by damped Gauss-Newton on iteratively reweighted least squares over an image pyramid. The
+rasteriser finds what is visible again before every step.
 """
 
 from collections.abc import Sequence
@@ -102,6 +102,8 @@ class FitStats(eqx.Module):
     """per level: (steps + 1,) energy of every term before each step and after the last"""
     steps: tuple[Array, ...]
     """steps used on each level"""
+    curvature: Float[Array, "p p"]
+    """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
 
 
 def fit_energy(weights: FitWeights, extra_terms: Sequence[Term] = ()) -> Energy:
@@ -166,7 +168,8 @@ def fit_parameters(
         y = solution.value
         histories.append(solution.stats["history"])
         used.append(solution.stats["num_steps"])
-    return y, FitStats(tuple(histories), tuple(used))
+        curvature = solution.stats["curvature"]
+    return y, FitStats(tuple(histories), tuple(used), curvature)
 
 
 def observe(
