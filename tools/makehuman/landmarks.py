@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.geometry.rotation import axis_angle
 from jaxface.geometry.subdivision import catmull_clark
 from jaxface.imaging.colour import linear_to_srgb
+from jaxface.models.landmark_schemes import LIPS_INNER
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.subdivide import subdivide
 from jaxface.render.image import render
@@ -28,6 +29,8 @@ DISTANCE = 760.0  # mm
 HEIGHT = 10.0  # mm: the pupils above the middle of the picture
 VIEWS = tuple((yaw, pitch) for yaw in (-32, -16, 0, 16, 32) for pitch in (-10, 6))
 LIGHTS = (((0.0, 0.3, 1.0), 0.6), ((0.6, 0.4, 0.8), 0.4), ((-0.5, 0.6, 0.7), 0.4))
+REFERENCE_JAW = 0.5  # activation of jawOpen
+OPEN_JAW = (0.12, 0.5)  # its range on the faces with an open mouth
 HUBER = 1.5  # mm
 REACH = 9.0  # px: a point off the skin (inner lid, silhouette) takes the nearest skin pixel
 HIDDEN = ("eyes", "mouth_interior", "ears")
@@ -35,31 +38,45 @@ HIDDEN = ("eyes", "mouth_interior", "ears")
 
 @dataclass(frozen=True)
 class Observations:
-    """Detections laid on the control mesh of the mean: where, how sure, and how scattered."""
+    """Detections laid on the control mesh of the reference shape: where and how sure."""
 
     points: np.ndarray  # (d, 468, 3) mm, zero where unseen
     weights: np.ndarray  # (d, 468), zero where unseen
     towards: np.ndarray  # (d, 3) unit direction to the camera, in the model's frame
+    opened: np.ndarray  # (d,) True where the mouth is open
+
+
+def reference_shape(model: MorphableModel) -> np.ndarray:
+    """The mean with its mouth half open (n, 3), so that upper and lower lip lie apart."""
+    return np.asarray(model.mean + model.expression(_jaw(model, REFERENCE_JAW)))
+
+
+def _jaw(model: MorphableModel, activation: float) -> jax.Array:
+    index = model.expression_names.index("jawOpen")
+    z = jnp.zeros(model.expression.count)
+    return z.at[index].set(activation / model.expression.std[index])
 
 
 def observe(
     model: MorphableModel, identities: np.ndarray, albedos: np.ndarray, seed: int
 ) -> Observations:
-    """Detect the 468 points on renders of sampled faces and carry them to the mean.
+    """Detect the 468 points on renders of sampled faces and carry them to the reference shape.
+
+    Every other face opens its mouth, for a closed one does not show which lip a point is on.
 
     Args:
         model: the control mesh; its landmarks are not used.
         identities: (s, i) coefficients of the faces to render.
         albedos: (s, a) likewise.
-        seed: of the small head turns that are added to the views.
+        seed: of the lights, jaws and small head turns that are added to the views.
     """
     rng = np.random.default_rng(seed)
     fine = subdivide(model, 1)
     refinement = catmull_clark(np.asarray(model.quads), model.vertex_count)
     # A point of the refined mesh is carried to the control mesh at the same parameters.
-    control = refinement.linear @ np.asarray(model.mean)
+    control = refinement.linear @ reference_shape(model)
     faces = np.asarray(fine.faces)
-    hidden = np.asarray(fine.region_mask(*HIDDEN))[faces].any(1)
+    hidden = np.asarray(fine.region_mask(*HIDDEN))[faces].any(axis=1)
     nets = bundled_networks()
     camera = Camera.from_field_of_view(FIELD_OF_VIEW, SIZE, SIZE)
     draw = jax.jit(
@@ -67,9 +84,10 @@ def observe(
             vertices, albedo, fine.faces, pose, camera, light, SIZE, SIZE, background=0.25
         )
     )
-    points, weights, towards = [], [], []
-    for identity, albedo in zip(identities, albedos, strict=True):
-        vertices = fine.shape(jnp.asarray(identity), jnp.zeros(fine.expression.count))
+    points, weights, towards, opened = [], [], [], []
+    for k, (identity, albedo) in enumerate(zip(identities, albedos, strict=True)):
+        jaw = rng.uniform(*OPEN_JAW) * (k % 2)
+        vertices = fine.shape(jnp.asarray(identity), _jaw(fine, jaw))
         colours = jnp.clip(fine.reflectance(jnp.asarray(albedo)), 0.0, 1.0)
         direction, ambient = LIGHTS[rng.integers(len(LIGHTS))]
         light = _light(direction, ambient) * 0.6 / float(colours.mean()) ** 0.5
@@ -83,13 +101,17 @@ def observe(
                 points.append(at)
                 weights.append(sure)
                 towards.append(turn[2])
-    return Observations(np.stack(points), np.stack(weights), np.stack(towards))
+                opened.append(jaw > 0)
+    return Observations(*(np.stack(x) for x in (points, weights, towards, opened)))
 
 
 def _carry(pixels, image, faces, hidden, control) -> tuple[np.ndarray, np.ndarray]:
     triangle = np.asarray(image.fragments.triangle)
-    skin = (triangle >= 0) & ~hidden[triangle]
-    away, (rows, columns) = distance_transform_edt(~skin, return_indices=True)
+    skin = np.logical_and(triangle >= 0, ~hidden[triangle])
+    away = np.asarray(distance_transform_edt(~skin))
+    rows, columns = np.asarray(
+        distance_transform_edt(~skin, return_distances=False, return_indices=True)
+    )
     column, row = np.clip(pixels.astype(int), 0, SIZE - 1).T
     far = away[row, column]
     row, column = rows[row, column], columns[row, column]
@@ -117,21 +139,24 @@ def consensus(
     Args:
         seen: the observations.
         mirror: index of each point's mirror image.
-        vertices: of the mean (n, 3).
-        normals: of the mean (n, 3).
+        vertices: of the reference shape (n, 3).
+        normals: of the reference shape (n, 3).
         rounds: of re-weighting.
 
     Raises:
         ValueError: a point and its mirror image were never seen.
     """
     flip = np.array([-1, 1, 1])
+    certain = seen.weights.copy()
+    certain[np.ix_(~seen.opened, np.isin(np.arange(468), LIPS_INNER))] = 0
     points = np.concatenate([seen.points, seen.points[:, mirror] * flip])
-    base = np.concatenate([seen.weights, seen.weights[:, mirror]])
+    base = np.concatenate([certain, certain[:, mirror]])
     towards = np.concatenate([seen.towards, seen.towards * flip])
     if (base.sum(0) == 0).any():
         raise ValueError(f"points never seen: {np.flatnonzero(base.sum(0) == 0).tolist()}")
-    nearest = cKDTree(vertices)
+    nearest = KDTree(vertices)
     weights = base * (towards[:, 2:].clip(0) ** 16)
+    mean, distance = points[0], np.zeros(base.shape)
     for _ in range(rounds):
         mean = np.einsum("dl,dlc->lc", weights, points) / weights.sum(0)[:, None]
         mean = (mean + mean[mirror] * flip) / 2
@@ -139,8 +164,8 @@ def consensus(
         facing = (towards @ normal.T).clip(0.02) ** 3
         distance = np.linalg.norm(points - mean, axis=2)
         weights = base * facing * np.minimum(1, HUBER / np.maximum(distance, 1e-6))
-    order = np.sort(np.where(weights > 0.1 * weights.max(0), distance, np.nan).ravel())
-    return mean, float(np.nanmedian(order))
+    counted = weights > 0.1 * weights.max(0)
+    return mean, float(np.median(distance[counted]))
 
 
 def attach(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> SurfacePoints:
@@ -165,7 +190,7 @@ def _closest_barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndar
     v = (d11 * d20 - d01 * d21) / determinant
     w = (d00 * d21 - d01 * d20) / determinant
     inside = np.stack([1 - v - w, v, w], axis=1)
-    candidates = [np.where((inside >= 0).all(1)[:, None], inside, [1.0, 0.0, 0.0])]
+    candidates = [np.where(inside.min(axis=1, keepdims=True) >= 0, inside, [1.0, 0.0, 0.0])]
     for i, (start, end) in enumerate(((a, b), (b, c), (c, a))):
         edge = end - start
         t = ((p - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12)

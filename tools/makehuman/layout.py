@@ -15,8 +15,8 @@ MIDLINE = 0.48315  # v of the body's UV that is the head's plane of symmetry
 FACE_HALF_WIDTH = 0.125  # in the body's UV: to just before the ears
 FACE_HEIGHT = 0.225  # in the body's UV: from under the chin to the hairline
 MAIN_TOP = 0.855
-TRANSITION = 0.4  # share of the compressed stretch over which the scale falls off
-SCALE = 2.45  # new UV per body UV inside the face
+TRANSITION = 0.25  # share of the compressed stretch over which the scale falls off
+SCALE = 2.7  # new UV per body UV inside the face
 # Slots (u0, v0, u1, v1) of the strip above.
 SLOTS = {
     "neck": (0.0, MAIN_TOP, 0.345, 1.0),
@@ -28,7 +28,7 @@ SLOTS = {
     "eye_r": (0.865, MAIN_TOP, 1.0, 1.0),
     "eye_cavity_r": (0.42, 0.775, 0.50, MAIN_TOP),
     "eye_cavity_l": (0.50, 0.775, 0.58, MAIN_TOP),
-    "neck_cap": (0.46, 0.695, 0.54, 0.775),
+    "neck_cap": (0.17, 0.0, 0.24, 0.07),
 }
 
 

