@@ -151,7 +151,7 @@ def test_zero_steps_return_the_start():
 
 
 def test_posterior_of_a_linear_gaussian_model(x64):
-    """x ~ N(0, I), b = A x + noise: covariance (I + A^T A / s^2)^-1, E = w (|x|^2 + |Ax-b|^2/s^2)."""
+    """x ~ N(0, I) seen through A with noise s: covariance (I + A^T A / s^2)^-1."""
     a = jnp.asarray(np.random.default_rng(3).normal(size=(10, 4)))
     sigma, weight = 0.3, 2.5e-5
     curvature = weight * (jnp.eye(4) + a.T @ a / sigma**2)

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from tests.small_scene import small_model, small_parameters
 
 from jaxface.energies.landmark import LandmarkData, landmark_residual, slide_contour
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.geometry.rotation import rotation_matrix
+from tests.small_scene import small_model, small_parameters
 
 
 @pytest.fixture

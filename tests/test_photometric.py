@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
-from tests.small_scene import small_model, small_parameters, small_samples
 
 from jaxface.energies.photometric import (
     PhotometricData,
@@ -24,6 +23,7 @@ from jaxface.energies.photometric_quadratic import (
     photometric_quadratic,
 )
 from jaxface.geometry.normal_stencil import normal_stencil
+from tests.small_scene import small_model, small_parameters, small_samples
 
 
 @pytest.fixture

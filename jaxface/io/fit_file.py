@@ -65,7 +65,7 @@ def read_fit(path: str | os.PathLike[str]) -> SavedFit:
         ValueError: not a fit, a damaged file, or one of a newer schema.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as stored:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except FileNotFoundError:
         raise

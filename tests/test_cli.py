@@ -1,0 +1,119 @@
+"""The command line as a user types it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from jaxface.cli import app
+from jaxface.io.fit_file import read_fit
+
+runner = CliRunner()
+
+
+def run(*arguments: object):
+    return runner.invoke(app, [str(a) for a in arguments])
+
+
+def test_help_lists_the_commands():
+    answer = run("--help")
+    assert answer.exit_code == 0
+    for name in ("digitize", "fit", "landmarks", "model"):
+        assert name in answer.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("fit", "no_such_photo.jpg", "-o", "OUT"),
+        ("fit", "demo", "-o", "OUT", "--levels", "a,b"),
+        ("fit", "demo", "-o", "OUT", "--weights", "beauty=3"),
+        ("fit", "demo", "-o", "OUT", "--weights", "photo=-1"),
+        ("fit", "demo", "-o", "OUT", "--model", "nobody"),
+        ("fit", "demo", "-o", "OUT", "--face", "7"),
+        ("landmarks", "demo", "-o", "OUT", "--scheme", "dlib5"),
+        ("model", "info", "missing.npz"),
+    ],
+)
+def test_mistakes_end_with_code_2_and_one_line(tmp_path, arguments):
+    answer = run(*[tmp_path / "out" if a == "OUT" else a for a in arguments])
+    assert answer.exit_code == 2, answer.output
+    assert "Traceback" not in answer.output
+    assert "error:" in answer.output
+
+
+def test_not_a_photo(tmp_path):
+    file = tmp_path / "notes.jpg"
+    file.write_text("not a photo")
+    answer = run("fit", file, "-o", tmp_path / "out")
+    assert answer.exit_code == 2
+    assert "notes.jpg" in answer.output.replace("\n", "")
+
+
+def test_no_face(tmp_path):
+    file = tmp_path / "noise.png"
+    noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3))
+    Image.fromarray(noise.astype(np.uint8)).save(file)
+    answer = run("landmarks", file, "-o", tmp_path / "out")
+    assert answer.exit_code == 2
+    assert "no face" in answer.output.replace("\n", " ")
+
+
+def test_empty_folder(tmp_path):
+    answer = run("fit", tmp_path, "-o", tmp_path / "out")
+    assert answer.exit_code == 2
+    assert "no photo" in answer.output.replace("\n", " ")
+
+
+def test_landmarks_of_the_demo(tmp_path):
+    answer = run("landmarks", "demo", "-o", tmp_path, "--scheme", "ibug68")
+    assert answer.exit_code == 0, answer.output
+    record = json.loads((tmp_path / "landmarks_0.json").read_text())
+    assert len(record["points"]) == 68
+    assert (tmp_path / "landmarks_0.pts").is_file()
+    assert Image.open(tmp_path / "landmarks.png").size == (512, 512)
+
+
+def test_model_info_json():
+    answer = run("model", "info", "makehuman", "--json")
+    assert answer.exit_code == 0
+    facts = json.loads(answer.stdout)
+    assert facts["expression_modes"] == 52
+    assert facts["landmarks68"] and facts["landmarks468"]
+
+
+@pytest.mark.slow
+def test_digitize_demo_then_a_folder_that_resumes(tmp_path):
+    """The whole journey at a small size, then a folder with one bad file, twice."""
+    from skimage import data
+
+    small = ("--size", "128", "--levels", "6,2", "--details", "0,0")
+    answer = run("digitize", "demo", "-o", tmp_path / "one", *small, "--resolution", "256")
+    assert answer.exit_code == 0, answer.output
+    names = (
+        "mesh.obj", "mesh.glb", "fit.npz", "albedo_partial.exr", "albedo_partial.png",
+        "visibility.png", "overlay.png", "report.html", "report.json",
+    )  # fmt: skip
+    assert not [n for n in names if not (tmp_path / "one" / n).is_file()]
+    saved = read_fit(tmp_path / "one" / "fit.npz")
+    assert saved.metadata["model"] == "makehuman"
+    assert all(np.isfinite(np.asarray(x)).all() for x in saved.arrays.values())
+    assert set(saved.metadata["energies"]) >= {"total", "photo", "landmark", "prior"}
+    report = json.loads((tmp_path / "one" / "report.json").read_text())
+    assert report["energies"] and report["timings"] and report["licences"]
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.fromarray(data.astronaut()).save(photos / "a.png")
+    (photos / "b.jpg").write_bytes(b"broken")
+    first = run("fit", photos, "-o", tmp_path / "many", *small)
+    assert first.exit_code == 2
+    assert "b.jpg" in first.output and "1 of 2" in first.output
+    stamp = (tmp_path / "many" / "a" / "report.json").stat().st_mtime_ns
+    (photos / "b.jpg").unlink()
+    second = run("fit", photos, "-o", tmp_path / "many", *small)
+    assert second.exit_code == 0, second.output
+    assert "done before" in second.output
+    assert (tmp_path / "many" / "a" / "report.json").stat().st_mtime_ns == stamp
