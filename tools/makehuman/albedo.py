@@ -122,10 +122,11 @@ def mouth_depth(head: HeadMesh, base: BaseMesh) -> np.ndarray:
     return np.where(inner, (z[bag].max() - z).clip(0), 0.0)
 
 
-def brow_mask(mean: np.ndarray, loops: list[np.ndarray], face: np.ndarray) -> np.ndarray:
+def brow_mask(mean: np.ndarray, loops: list[np.ndarray], front: np.ndarray) -> np.ndarray:
     """Soft mask (n,) of the brows: 1 inside the loops ((k, 3) mm, seen from the front).
 
-    It falls to 0 over BROW_SOFTNESS outside the loop and rises to 1 over as much inside.
+    It falls to 0 over BROW_SOFTNESS outside the loop and rises to 1 over as much inside, a little
+    inset. ``front`` (n,) is True on the front of the head, or brows would show on its back.
     """
     mask = np.zeros(len(mean))
     for loop in loops:
@@ -137,7 +138,7 @@ def brow_mask(mean: np.ndarray, loops: list[np.ndarray], face: np.ndarray) -> np
         inside = Path(corners).contains_points(mean[:, :2])
         signed = np.where(inside, distance, -distance)
         mask = np.maximum(mask, (0.5 + (signed - BROW_INSET) / (2 * BROW_SOFTNESS)).clip(0, 1))
-    return mask * face
+    return mask * front
 
 
 def sample_albedos(
