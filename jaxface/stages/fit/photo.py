@@ -8,11 +8,31 @@ import numpy as np
 from jaxface._types import Float
 from jaxface.imaging.crop import Crop, crop_face
 from jaxface.imaging.masks import face_oval_mask
+from jaxface.models.landmark_schemes import CONTOURS, INNER_68, MEDIAPIPE_TO_IBUG68
 from jaxface.stages.fit.solve import FitInput
 
 OUTER_EYE_CORNERS = {68: (36, 45), 468: (33, 263)}
 DEFAULT_FOCAL = 1.4
 """focal length over the photo's longer side if the file does not tell: a 50 mm lens at 35 mm"""
+
+
+SMOOTH_SKIN_WEIGHT = 0.1
+"""share of the face mesh's points on forehead and cheeks, which no feature of the photo fixes"""
+
+
+def landmark_weights(count: int) -> Float[np.ndarray, "l"]:
+    """How much each landmark counts: those on eyes, brows, nose and lips fully.
+
+    Of the 468 points two thirds lie on smooth skin or the rim, where the detector interpolates:
+    they say little and are biased towards its own mean face.
+    """
+    if count == 68:
+        return np.ones(68)
+    weights = np.full(count, SMOOTH_SKIN_WEIGHT)
+    features = [i for name, line in CONTOURS.items() if name != "face oval" for i in line]
+    weights[features] = 1.0
+    weights[MEDIAPIPE_TO_IBUG68[INNER_68].reshape(-1)] = 1.0
+    return weights
 
 
 class WorkingPhoto(NamedTuple):
@@ -87,7 +107,7 @@ def working_photo(
         image=array(crop.image * gain),
         mask=array(valid),
         landmarks=array(inside),
-        landmark_weight=array(np.ones(len(points))),
+        landmark_weight=array(landmark_weights(len(points))),
         landmark_unit=array(np.linalg.norm(inside[left] - inside[right])),
         principal=array(centre),
         log_focal=array(np.log(focal_side)),
