@@ -112,7 +112,11 @@ def compare(
     distance = aligned_distances(shape, true_shape)
     baseline = aligned_distances(np.asarray(model.mean)[region], true_shape)
     albedo = np.asarray(model.reflectance(estimate.albedo))[region]
-    true_albedo, mean_albedo = truth["albedo"][region], np.asarray(model.albedo_mean)[region]
+    mean_albedo = np.asarray(model.albedo_mean)[region]
+    if "albedo" in truth:
+        true_albedo = truth["albedo"][region]
+    else:
+        true_albedo = np.asarray(model.reflectance(truth["albedo_coefficients"]))[region]
     # A face shows the half of the sphere that is turned to the camera.
     normals, true_light = truth["sphere_normals"], truth["sphere_irradiance"] / np.pi
     front = normals[:, 2] > 0.1

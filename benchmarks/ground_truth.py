@@ -8,7 +8,6 @@ with mitsuba under a distant light (shadows and bounces included) and writes for
 """
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -23,8 +22,9 @@ from jaxface.io.models import load_model
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
 
-# Sliders that do not make a face by themselves, or move what the props stand for.
 IRISES = ((0.10, 0.05, 0.025), (0.10, 0.16, 0.22), (0.08, 0.11, 0.05))  # linear RGB
+MESHES = ("vertices_camera", "albedo")
+# Sliders that do not make a face by themselves, or move what the props stand for.
 UNDRAWN = ("eyeLook", "mouthClose", "eyeBlink", "tongueOut")
 
 
@@ -117,8 +117,9 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def model_digest(model: MorphableModel) -> str:
-    """Fingerprint of a model's geometry: coefficients mean the same face only where it agrees."""
-    arrays = (model.mean, model.identity.basis, model.expression.basis, model.faces)
+    """Fingerprint of a model: coefficients mean the same face only where it agrees."""
+    bases = (model.identity.basis, model.expression.basis, model.albedo.basis)
+    arrays = (model.mean, model.albedo_mean, model.faces, *bases)
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -237,6 +238,7 @@ def main(
     roughness: Annotated[float | None, typer.Option(help="add a glossy coat (0.3: skin)")] = None,
     paint: Annotated[bool, typer.Option(help="paint the albedo instead of drawing it")] = False,
     refine: Annotated[int, typer.Option(help="subdivide the model so many times")] = 0,
+    lean: Annotated[bool, typer.Option(help="JPEG and coefficients only, for tests")] = False,
     seed: Annotated[int, typer.Option()] = 0,
     variant: Annotated[str, typer.Option(help="mitsuba variant")] = "scalar_rgb",
 ) -> None:
@@ -255,12 +257,15 @@ def main(
                 photo, image, truth = photograph(
                     mi, subject, angle, name, rng, size, samples, shadows, roughness, own
                 )
+                if lean:
+                    Image.fromarray(photo).save(out / f"{stem}.jpg", quality=92)
+                    kept = {k: v for k, v in truth.items() if k not in MESHES}
+                    np.savez_compressed(out / f"{stem}.npz", **kept)
+                    continue
                 Image.fromarray(photo).save(out / f"{stem}.png")
                 mi.Bitmap(image.astype(np.float16)).write(str(out / f"{stem}.exr"))
                 np.savez_compressed(out / f"{stem}.npz", **truth)
                 typer.echo(stem)
-    listing = sorted(p.stem for p in out.glob("*.npz"))
-    (out / "index.json").write_text(json.dumps(listing, indent=1))
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def _eyeball(rim: np.ndarray, outward: np.ndarray, gaze: np.ndarray, iris: np.nd
     nw, ne = index[:-1], np.roll(index[:-1], -1, axis=1)
     sw, se = index[1:], np.roll(index[1:], -1, axis=1)
     faces = np.concatenate(
-        [np.stack([nw, sw, ne], -1).reshape(-1, 3), np.stack([ne, sw, se], -1).reshape(-1, 3)]
+        [np.stack([nw, ne, sw], -1).reshape(-1, 3), np.stack([ne, se, sw], -1).reshape(-1, 3)]
     )
     return Surface(centre + EYEBALL_RADIUS * unit.reshape(-1, 3) @ frame, faces, colour, 0.05)
 
