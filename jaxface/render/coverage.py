@@ -12,19 +12,19 @@ Corners are triples of arrays, ``x[i]`` the x coordinates (px) of corner i of ev
 
 import jax.numpy as jnp
 
-from jaxface._types import Array, Bool, Int
+from jaxface._types import Array, Bool, Float, Int
 
-TILE_ROWS = 5
-TILE_COLUMNS = 6
-TILE_PIXELS = TILE_ROWS * TILE_COLUMNS
-"""a tile's coverage fits an int32"""
+TILE_PIXELS = 30
+"""pixels of a tile: its coverage fits an int32"""
 
 Corners = tuple[Array, Array, Array]
 
 
 def top_left(x: Corners, y: Corners, i: int) -> Bool[Array, "..."]:
-    """Whether the edge from corner i to the next is a top or left one, for a triangle that runs
-    clockwise on the screen (y down); for the other winding it is the negation."""
+    """Whether the edge from corner i to the next is a top or left one.
+
+    So for a triangle that runs clockwise on the screen (y down); negate for the other winding.
+    """
     j = (i + 1) % 3
     return (y[j] < y[i]) | ((y[j] == y[i]) & (x[j] > x[i]))
 
@@ -45,68 +45,98 @@ def pixel_block(
     columns = jnp.clip(jnp.floor(high_x - 0.5), -1, width - 1) - first_x + 1
     rows = jnp.clip(jnp.floor(high_y - 0.5), -1, height - 1) - first_y + 1
     drawable = drawable & (columns > 0) & (rows > 0)
-    block = first_x, first_y, jnp.where(drawable, columns, 0), jnp.where(drawable, rows, 0)
-    return tuple(jnp.where(jnp.isnan(b), 0, b).astype(jnp.int32) for b in block)
+    block = [
+        jnp.where(drawable, value, 0).astype(jnp.int32)
+        for value in (first_x, first_y, columns, rows)
+    ]
+    return block[0], block[1], block[2], block[3]
+
+
+def surely_behind(x: Corners, y: Corners) -> Bool[Array, "..."]:
+    """Triangles that run clockwise on the screen beyond rounding; slivers are left in doubt."""
+    one, other = (x[1] - x[0]) * (y[2] - y[0]), (y[1] - y[0]) * (x[2] - x[0])
+    return one - other > 1e-5 * (jnp.abs(one) + jnp.abs(other))
+
+
+def tile_shape(
+    columns: Int[Array, "..."], rows: Int[Array, "..."]
+) -> tuple[Int[Array, "..."], Int[Array, "..."]]:
+    """Columns and rows of the tiles that a block is cut into: one tile wherever that can hold it.
+
+    Blocks too large for one are cut into tiles of 6 to 10 columns, which waste few bits.
+    """
+    columns = jnp.maximum(columns, 1).astype(jnp.float32)
+    widest = jnp.maximum(10.0, jnp.floor(TILE_PIXELS / jnp.maximum(rows, 1).astype(jnp.float32)))
+    wide = jnp.ceil(columns / jnp.ceil(columns / widest))
+    return wide.astype(jnp.int32), jnp.floor(TILE_PIXELS / wide).astype(jnp.int32)
 
 
 def tile_bits(
     x: Corners,
     y: Corners,
-    first_x: Int[Array, "..."],
-    first_y: Int[Array, "..."],
+    left: Int[Array, "..."],
+    top: Int[Array, "..."],
     columns: Int[Array, "..."],
     rows: Int[Array, "..."],
+    wide: Int[Array, "..."],
     cull: bool,
 ) -> Int[Array, "..."]:
-    """Coverage of one tile of each triangle: bit ``r * TILE_COLUMNS + c`` is the centre r rows
-    below and c columns right of the tile's first pixel.
+    """Coverage of one tile of each triangle, as bits.
+
+    Bit ``r * wide + c`` is the pixel centre r rows below and c right of the tile's first pixel.
 
     Args:
         x: columns of the corners, px.
         y: rows of the corners, px.
-        first_x: column of the tile's first pixel.
-        first_y: its row.
-        columns: columns of the block from the tile's first pixel on; more than a tile's is fine.
+        left: column of the tile's first pixel.
+        top: its row.
+        columns: columns of the block from the tile's first pixel on, perhaps more than the tile's.
         rows: rows likewise.
+        wide: columns of the tile.
         cull: leave out triangles that run clockwise on the screen, those seen from behind.
     """
-    left, top = first_x.astype(x[0].dtype) + 0.5, first_y.astype(x[0].dtype) + 0.5
-    sides = []
+    dtype = x[0].dtype
+    start, cy = left.astype(dtype) + 0.5, top.astype(dtype) + 0.5
+    past_block, past_tile = start + columns.astype(dtype), start + wide.astype(dtype)
+    bottom = cy + rows.astype(dtype)
+    edges = []
     for i in range(3):
         j = (i + 1) % 3
         keep = top_left(x, y, i)
         # Turned so that every edge is a top-left one, a tie always counts as inside.
         ax, ay = jnp.where(keep, x[i], x[j]), jnp.where(keep, y[i], y[j])
         bx, by = jnp.where(keep, x[j], x[i]), jnp.where(keep, y[j], y[i])
-        bits = jnp.zeros_like(columns)
-        for r in range(TILE_ROWS):
-            for c in range(TILE_COLUMNS):
-                cx, cy = left + c, top + r
-                inside = (ax - cx) * (by - cy) >= (ay - cy) * (bx - cx)
-                bits = bits | jnp.where(inside, 1 << (r * TILE_COLUMNS + c), 0)
-        sides.append(jnp.where(keep, bits, ~bits))
+        edges.append((keep, ax, ay, bx, by))
+    sides = [jnp.zeros_like(columns) for _ in edges]
+    block = jnp.zeros_like(columns)
+    cx = start
+    for bit in range(TILE_PIXELS):
+        for i, (_, ax, ay, bx, by) in enumerate(edges):
+            inside = (ax - cx) * (by - cy) >= (ay - cy) * (bx - cx)
+            sides[i] = sides[i] | jnp.where(inside, 1 << bit, 0)
+        block = block | jnp.where((cx < past_block) & (cy < bottom), 1 << bit, 0)
+        cx = cx + 1.0
+        wrap = cx >= past_tile
+        cx, cy = jnp.where(wrap, start, cx), jnp.where(wrap, cy + 1.0, cy)
+    sides = [jnp.where(keep, side, ~side) for (keep, *_), side in zip(edges, sides, strict=True)]
     covered = ~(sides[0] | sides[1] | sides[2])
     if not cull:
         covered = covered | (sides[0] & sides[1] & sides[2])
-    every_row = sum(1 << (r * TILE_COLUMNS) for r in range(TILE_ROWS))
-    in_columns = ((1 << jnp.clip(columns, 0, TILE_COLUMNS)) - 1) * every_row
-    in_rows = (1 << (TILE_COLUMNS * jnp.clip(rows, 0, TILE_ROWS))) - 1
-    return covered & in_columns & in_rows
+    return covered & block
 
 
-def depth_at(x: Corners, y: Corners, z: Corners, cx: Array, cy: Array) -> Array:
-    """Depth (mm) of covering triangles at the pixel centres (cx, cy).
+def inverse_depth_at(
+    x: Corners, y: Corners, inverse: Corners, cx: Float[Array, "..."], cy: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Inverse depth (1/mm) of covering triangles at the pixel centres (cx, cy).
 
-    The inverse depth is a convex combination of the corners', by weights that are magnitudes of
-    the edge functions, so a sliver's rounding cannot take the depth outside its corners'. No
-    product here is directly added to anything, so no compiler can contract one into a fused
-    multiply-add: the same fragment has bitwise the same depth wherever it is evaluated.
+    A convex combination of the corners' inverse depths, by weights that are magnitudes of the
+    edge functions, so a sliver's rounding cannot take it outside its corners'.
     """
     rx, ry = [v - cx for v in x], [v - cy for v in y]
-    weights = []
-    for j, k in ((1, 2), (2, 0), (0, 1)):
-        one, other = rx[j] * ry[k], ry[j] * rx[k]
-        weights.append(jnp.maximum(one, other) - jnp.minimum(one, other))
-    total = weights[0] + weights[1] + weights[2]
-    inverse = weights[0] / z[0] + weights[1] / z[1] + weights[2] / z[2]
-    return jnp.where(inverse > 0, total / jnp.where(inverse > 0, inverse, 1.0), z[0])
+    total, weighted = 0.0, 0.0
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        weight = jnp.abs(rx[j] * ry[k] - ry[j] * rx[k])
+        total = total + weight
+        weighted = weighted + weight * inverse[i]
+    return jnp.where(total > 0, weighted / jnp.where(total > 0, total, 1.0), inverse[0])

@@ -16,4 +16,5 @@ def interpolate(
     """
     seen = jnp.maximum(fragments.triangle, 0)
     weights = fragments.barycentric[..., None]
-    return sum(weights[..., i, :] * values[faces[:, i][seen]] for i in range(3))
+    a, b, c = (weights[..., i, :] * values[faces[:, i][seen]] for i in range(3))
+    return a + b + c

@@ -1,15 +1,15 @@
 """The z-buffer: which triangle is nearest at each pixel.
 
 Two passes over fragments settle a pixel without packing depth and index in one word: a
-scatter-min of the depth, then a scatter-min of the index among fragments that have exactly that
-depth. The art is to have few fragments, and none that miss:
+scatter-max of the inverse depth, then a scatter-min of the index among fragments that have exactly
+that depth. The art is to have few fragments, and none that miss:
 
-1. The coverage of the tile at the corner of each triangle's bounding box is computed at once, as
-   the bits of an integer. Rounds hand one bit a triangle to the z-buffer, ``ROUNDS`` at most,
-   which serves nearly all triangles of a fine mesh.
-2. What that leaves (a tile with more covered centres, boxes larger than a tile) is listed,
-   compacted, and drawn in batches of tiles by a loop that ends when the list does. A triangle
-   of any size is right, memory is bounded, and no capacity can be exceeded.
+1. The coverage of a tile of 30 pixels, shaped to each triangle's bounding box, is computed at once,
+   as the bits of an integer. Rounds hand one bit a triangle to the z-buffer, ``ROUNDS`` at most,
+   which serves most triangles of a fine mesh.
+2. What that leaves (more covered centres, boxes larger than a tile) is listed, compacted, and
+   drawn in batches of tiles by a loop that ends when the list does. A triangle of any size is
+   right, memory is bounded, and no capacity can be exceeded.
 
 Rounds are loops rather than unrolled because a loop's operands are stored: XLA would otherwise
 fuse the coverage into, and so repeat it for, every one of its uses.
@@ -25,19 +25,19 @@ import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float, Int
 from jaxface.render.coverage import (
-    TILE_COLUMNS,
     TILE_PIXELS,
-    TILE_ROWS,
     Corners,
-    depth_at,
+    inverse_depth_at,
     pixel_block,
+    surely_behind,
     tile_bits,
+    tile_shape,
 )
 
 ROUNDS = 4
 """fragments a triangle that are drawn before the rest is compacted"""
 BATCH = 8192
-"""tiles drawn per iteration of the loop over the rest"""
+"""tiles drawn per iteration of the loop over the rest, more for large images"""
 NONE = jnp.iinfo(jnp.int32).max
 
 
@@ -46,7 +46,8 @@ class Tiles(NamedTuple):
 
     x: Corners
     y: Corners
-    z: Corners
+    inverse: Corners
+    """inverse depths of the corners, 1/mm"""
     left: Int[Array, "t"]
     """column of the tile's first pixel"""
     top: Int[Array, "t"]
@@ -54,14 +55,16 @@ class Tiles(NamedTuple):
     columns: Int[Array, "t"]
     """columns of the triangle's bounding box from there on"""
     rows: Int[Array, "t"]
+    wide: Int[Array, "t"]
+    """columns of the tile"""
     scene: Int[Array, "t"]
     triangle: Int[Array, "t"]
 
 
 class Buffer(NamedTuple):
-    """Nearest depth (mm, inf for none) and its triangle (NONE for none) at every pixel."""
+    """Largest inverse depth (1/mm, 0 for none) and its triangle (or NONE) at every pixel."""
 
-    depth: Float[Array, "p"]
+    inverse: Float[Array, "p"]
     triangle: Int[Array, "p"]
 
 
@@ -82,43 +85,51 @@ def nearest_triangles(
         )
         for k in range(3)
     )
-    finite = jnp.isfinite(sum(x)) & jnp.isfinite(sum(y)) & jnp.isfinite(sum(z))
+    inverse = tuple(1.0 / depth for depth in z)
+    finite = jnp.isfinite(sum(x)) & jnp.isfinite(sum(y)) & jnp.isfinite(sum(inverse))
     drawable = finite & (z[0] > near) & (z[1] > near) & (z[2] > near)
+    if cull:
+        drawable = drawable & ~surely_behind(x, y)
     triangle = jnp.arange(scenes * count, dtype=jnp.int32)
-    tiles = Tiles(x, y, z, *pixel_block(x, y, drawable, height, width), triangle // count, triangle)
+    left, top, columns, rows = pixel_block(x, y, drawable, height, width)
+    wide, high = tile_shape(columns, rows)
+    tiles = Tiles(x, y, inverse, left, top, columns, rows, wide, triangle // count, triangle)
     pixels = scenes * height * width
-    buffer = Buffer(jnp.full((pixels,), jnp.inf, x[0].dtype), jnp.full((pixels,), NONE, jnp.int32))
+    # Every batch passes over the whole image once, so large images get large batches.
+    batch = max(BATCH, pixels // 32)
+    buffer = Buffer(jnp.zeros((pixels,), x[0].dtype), jnp.full((pixels,), NONE, jnp.int32))
     buffer, rest = _draw(buffer, tiles, _bits(tiles, cull), ROUNDS, height, width)
 
     # Few-fragment tiles first: a batch takes as many rounds as its fullest tile.
-    large = (tiles.columns > TILE_COLUMNS) | (tiles.rows > TILE_ROWS)
+    large = (columns > wide) | (rows > high)
     few = ~large & (jax.lax.population_count(rest) <= ROUNDS)
     first, second = _running_count(few & (rest != 0)), _running_count(~few)
     length = first[-1] + second[-1]
     place = jnp.where(few, jnp.where(rest != 0, first - 1, length), first[-1] + second - 1)
-    place = jnp.where(place < length, place, scenes * count + BATCH)
-    queue = jnp.zeros((scenes * count + BATCH,), jnp.int32).at[place].set(triangle, mode="drop")
+    place = jnp.where(place < length, place, scenes * count + batch)
+    queue = jnp.zeros((scenes * count + batch,), jnp.int32).at[place].set(triangle, mode="drop")
 
     def draw_batch(state):
         cursor, done, buffer = state
-        window = jax.lax.dynamic_slice(queue, (cursor,), (BATCH,))
-        slot = jnp.arange(BATCH, dtype=jnp.int32)
+        window = jax.lax.dynamic_slice(queue, (cursor,), (batch,))
+        slot = jnp.arange(batch, dtype=jnp.int32)
         box = jax.tree.map(lambda v: v[window], tiles)
-        across = -(-box.columns // TILE_COLUMNS)
+        across = -(-box.columns // box.wide)
+        high = TILE_PIXELS // box.wide
         skip = jnp.where(rest[window] != 0, 0, 1)
-        wanted = across * -(-box.rows // TILE_ROWS) - skip
+        wanted = across * -(-box.rows // high) - skip
         left_over = jnp.where(cursor + slot < length, wanted, 0).at[0].add(-done)
-        left_over = jnp.minimum(left_over, BATCH + 1)  # so that the sum cannot overflow
+        left_over = jnp.minimum(left_over, batch + 1)  # so that the sum cannot overflow
         ends = jnp.cumsum(left_over, dtype=jnp.int32)
         starts = ends - left_over
-        mark = jnp.zeros((BATCH,), jnp.int32)
+        mark = jnp.zeros((batch,), jnp.int32)
         mark = mark.at[starts].add((left_over > 0).astype(jnp.int32), mode="drop")
         owner = jnp.cumsum(mark, dtype=jnp.int32) - 1
         live = slot < ends[-1]
         tile = slot - starts[owner] + jnp.where(owner == 0, done, 0) + skip[owner]
-        shift_x = tile % jnp.maximum(across[owner], 1) * TILE_COLUMNS
-        shift_y = tile // jnp.maximum(across[owner], 1) * TILE_ROWS
         here = jax.tree.map(lambda v: v[window[owner]], tiles)
+        shift_x = tile % jnp.maximum(across[owner], 1) * here.wide
+        shift_y = tile // jnp.maximum(across[owner], 1) * high[owner]
         here = here._replace(
             left=here.left + shift_x,
             top=here.top + shift_y,
@@ -127,9 +138,9 @@ def nearest_triangles(
         )
         bits = jnp.where(tile == 0, jnp.where(live, rest[here.triangle], 0), _bits(here, cull))
         buffer, _ = _draw(buffer, here, bits, TILE_PIXELS, height, width)
-        finished = jnp.sum(ends <= BATCH, dtype=jnp.int32)
-        begun = jnp.where(finished == 0, done + BATCH, BATCH - starts[finished])
-        return cursor + finished, jnp.where(finished < BATCH, begun, 0), buffer
+        finished = jnp.sum(ends <= batch, dtype=jnp.int32)
+        begun = jnp.where(finished == 0, done + batch, batch - starts[finished])
+        return cursor + finished, jnp.where(finished < batch, begun, 0), buffer
 
     start = (jnp.int32(0), jnp.int32(0), buffer)
     *_, buffer = jax.lax.while_loop(lambda state: state[0] < length, draw_batch, start)
@@ -138,7 +149,7 @@ def nearest_triangles(
 
 
 def _bits(tiles: Tiles, cull: bool) -> Int[Array, "t"]:
-    return tile_bits(tiles.x, tiles.y, tiles.left, tiles.top, tiles.columns, tiles.rows, cull)
+    return tile_bits(tiles.x, tiles.y, *tiles[3:8], cull)
 
 
 def _running_count(flags: Bool[Array, "t"]) -> Int[Array, "t"]:
@@ -158,34 +169,34 @@ def _draw(
     buffer: Buffer, tiles: Tiles, bits: Int[Array, "t"], rounds: int, height: int, width: int
 ) -> tuple[Buffer, Int[Array, "t"]]:
     """The first ``rounds`` fragments of each tile into the buffer, and the bits not drawn."""
-    pixels = buffer.depth.shape[0]
+    pixels, dtype = buffer.inverse.size, buffer.inverse.dtype
 
     def fragment(rest):
         place = jax.lax.population_count((rest & -rest) - 1)
-        row = sum((place >= r * TILE_COLUMNS).astype(jnp.int32) for r in range(1, TILE_ROWS))
-        px, py = tiles.left + place - row * TILE_COLUMNS, tiles.top + row
+        row = jnp.floor((place.astype(jnp.float32) + 0.5) / tiles.wide.astype(jnp.float32))
+        row = row.astype(jnp.int32)
+        px, py = tiles.left + place - row * tiles.wide, tiles.top + row
         at = jnp.where(rest != 0, (tiles.scene * height + py) * width + px, pixels)
-        dtype = buffer.depth.dtype
-        return at, depth_at(*tiles[:3], px.astype(dtype) + 0.5, py.astype(dtype) + 0.5)
+        centre = px.astype(dtype) + 0.5, py.astype(dtype) + 0.5
+        return at, inverse_depth_at(tiles.x, tiles.y, tiles.inverse, *centre)
 
     def going(state):
-        turn, rest, _ = state
+        turn, rest, *_ = state
         return (turn < rounds) & jnp.any(rest != 0)
 
-    def lower(state):
-        turn, rest, depth = state
-        at, d = fragment(rest)
-        return turn + 1, rest & (rest - 1), depth.at[at].min(d, mode="drop")
+    def approach(state):
+        turn, rest, nearest, drawn = state
+        at, inverse = fragment(rest)
+        drawn = jax.tree.map(lambda all, one: all.at[turn].set(one), drawn, (at, inverse))
+        return turn + 1, rest & (rest - 1), nearest.at[at].max(inverse, mode="drop"), drawn
 
-    def claim(state):
-        turn, rest, triangle = state
-        at, d = fragment(rest)
-        won = d == depth.at[at].get(mode="fill", fill_value=-1.0)
-        at = jnp.where(won, at, pixels)
-        return turn + 1, rest & (rest - 1), triangle.at[at].min(tiles.triangle, mode="drop")
+    def claim(turn, triangle):
+        at, inverse = (one[turn] for one in drawn)
+        won = inverse == nearest.at[at].get(mode="fill", fill_value=-1.0)
+        return triangle.at[jnp.where(won, at, pixels)].min(tiles.triangle, mode="drop")
 
-    first = jnp.int32(0)
-    _, rest, depth = jax.lax.while_loop(going, lower, (first, bits, buffer.depth))
-    triangle = jnp.where(depth < buffer.depth, NONE, buffer.triangle)
-    *_, triangle = jax.lax.while_loop(going, claim, (first, bits, triangle))
-    return Buffer(depth, triangle), rest
+    drawn = jnp.zeros((rounds, bits.size), jnp.int32), jnp.zeros((rounds, bits.size), dtype)
+    start = (jnp.int32(0), bits, buffer.inverse, drawn)
+    turns, rest, nearest, drawn = jax.lax.while_loop(going, approach, start)
+    triangle = jnp.where(nearest > buffer.inverse, NONE, buffer.triangle)
+    return Buffer(nearest, jax.lax.fori_loop(0, turns, claim, triangle)), rest
