@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxface._types import Array, Float
 from jaxface.models.morphable import MorphableModel
-from jaxface.stages.fit import FitConfig, FitInput, FitWeights, _fit_landmarks
-from jaxface.stages.fit_model import FitModel, prepare
+from jaxface.stages.fit import FitConfig, FitInput, FitModel, FitWeights, prepare
+from jaxface.stages.fit.solve import _fit_landmarks
 
 
 def _landmarks_to_shape(

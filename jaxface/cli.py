@@ -164,8 +164,9 @@ def model_import(
         save_model(out, model)
     facts = describe(model)
     _console.print(
-        f"wrote [bold]{out}[/bold]: {facts['vertices']} vertices, {facts['identity_modes']} identity, "
-        f"{facts['expression_modes']} expression and {facts['albedo_modes']} albedo modes"
+        f"wrote [bold]{out}[/bold]: {facts['vertices']} vertices, "
+        f"{facts['identity_modes']} identity, {facts['expression_modes']} expression and "
+        f"{facts['albedo_modes']} albedo modes"
     )
     if not (facts["landmarks68"] or facts["landmarks468"]):
         _console.print("it has no landmark correspondences yet: jaxface model embed-landmarks")

@@ -116,7 +116,7 @@ def test_pose_from_landmarks_recovers_a_perspective_pose(yaw, pitch, roll, dista
 def test_similarity_transform_recovers(seed):
     rng = np.random.default_rng(seed)
     source = rng.normal(size=(12, 3))
-    turn = scipy.spatial.transform.Rotation.random(random_state=seed).as_matrix()
+    turn = scipy.spatial.transform.Rotation.random(rng=seed).as_matrix()
     target = 1.7 * source @ turn.T + [1.0, 2.0, 3.0]
     with jax.enable_x64(True):
         scale, rotation, shift = similarity_transform(jnp.asarray(source), jnp.asarray(target))

@@ -73,7 +73,7 @@ def test_least_squares_methods_agree(x64, method):
 
 def test_unknown_method_is_named():
     with pytest.raises(ValueError, match="newton_raphson"):
-        least_squares(rosenbrock, jnp.zeros(2), 1.0, method="newton_raphson")  # pyright: ignore
+        least_squares(rosenbrock, jnp.zeros(2), 1.0, method="newton_raphson")
 
 
 def test_descends_where_plain_gauss_newton_diverges(x64):

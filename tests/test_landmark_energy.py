@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxface.energies.landmark import LandmarkData, landmark_residual, slide_contour
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.geometry.rotation import rotation_matrix
+from jaxface.models.morphable import SurfacePoints
 from tests.small_scene import small_model, small_parameters
 
 
@@ -97,7 +98,7 @@ def test_hidden_contour_slides_to_the_silhouette(x64):
     vertices = np.asarray(model.mean)
     hidden = int(np.argmin(vertices[:, 2]))
     front = int(np.argmax(vertices[:, 2]))
-    points = model.landmarks68.__class__(
+    points = SurfacePoints(
         jnp.array([[hidden] * 3, [front] * 3]), jnp.tile(jnp.array([1.0, 0.0, 0.0]), (2, 1))
     )
     posed = y.pose(model.mean)

@@ -48,7 +48,7 @@ def test_distance_is_exact_up_to_its_limit(seed, limit):
     mask = random_mask(seed)
     expected = distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, np.inf)
     ours = distance_to(jnp.asarray(mask), limit)
-    np.testing.assert_allclose(ours, np.minimum(expected, limit), rtol=1e-6)
+    np.testing.assert_allclose(ours, np.minimum(np.asarray(expected), limit), rtol=1e-6)
 
 
 @pytest.mark.parametrize("radius", [0, 1, 1.5, 4])

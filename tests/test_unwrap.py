@@ -61,8 +61,8 @@ def ellipsoid(rows=24, columns=40):
 def build() -> Scene:
     """The egg with a square card before it (its own chart below), partly out of the picture."""
     vertices, faces, uv, uv_faces = ellipsoid()
-    outward = np.sum(np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
-                     * vertices[faces].mean(1))
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    outward = np.sum(np.cross(b - a, c - a) * (a + b + c))
     assert outward > 0
     card = np.array([[-5, -60, 110], [45, -60, 110], [45, 10, 110], [-5, 10, 110.0]])
     card_uv = np.array([[0.1, 0.05], [0.35, 0.05], [0.35, 0.35], [0.1, 0.35]])
@@ -169,7 +169,7 @@ def test_visibility_agrees_with_brute_force_rays(scene):
     for axis in (0, 1):
         jump = np.abs(np.diff(depth, axis=axis)) > 8
         smooth &= ~np.insert(jump, 0, False, axis) & ~np.insert(jump, jump.shape[axis], False, axis)
-    clearance = distance_transform_edt(np.pad(smooth, 1))[1:-1, 1:-1]
+    clearance = np.asarray(distance_transform_edt(np.pad(smooth, 1)))[1:-1, 1:-1]
 
     def to_contour(texels):
         return clearance[y[texels].astype(int), x[texels].astype(int)]

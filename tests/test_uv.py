@@ -82,7 +82,7 @@ def test_gutter_repeats_the_nearest_texel(width):
     uv, faces = jittered_grid(3, 1, 0.3, 0.7)
     layout = uv_layout(uv, faces, 80, gutter=width)
     inside = np.asarray(layout.inside)
-    distance = distance_transform_edt(~inside)
+    distance = np.asarray(distance_transform_edt(~inside))
     filled = np.asarray(layout.triangle) >= 0
     assert filled[distance <= max(width - 1, 0)].all()
     assert not filled[distance > 1.42 * width].any()

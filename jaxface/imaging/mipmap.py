@@ -23,9 +23,7 @@ class Mipmap(eqx.Module):
         """Index of the last level."""
         return len(self.shapes) - 1
 
-    def bilinear(
-        self, points: Float[Array, "n 2"], level: Array | int = 0
-    ) -> Float[Array, "n c"]:
+    def bilinear(self, points: Float[Array, "n 2"], level: Array | int = 0) -> Float[Array, "n c"]:
         """Bilinear samples of one level at (x, y) px of the *image*, clamped to its edge.
 
         Args:

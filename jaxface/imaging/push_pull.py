@@ -6,9 +6,7 @@ import jax.numpy as jnp
 from jaxface._types import Array, Float
 
 
-def push_pull(
-    values: Float[Array, "h w c"], weight: Float[Array, "h w"]
-) -> Float[Array, "h w c"]:
+def push_pull(values: Float[Array, "h w c"], weight: Float[Array, "h w"]) -> Float[Array, "h w c"]:
     """Keep values of weight 1, replace those of weight 0 by a smooth continuation of the rest.
 
     Gortler, Grzeszczuk, Szeliski and Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4: weighted

@@ -53,8 +53,9 @@ def write_fit(
         raise ValueError(f"arrays {clash} carry names of the fit's own parameters")
     own = {name: np.asarray(getattr(parameters, name)) for name in _PARAMETERS}
     text = json.dumps({"schema": SCHEMA, **metadata})
+    entries: dict[str, Any] = {**own, **arrays, "metadata": np.array(text)}
     with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **own, **arrays, metadata=np.array(text))
+        np.savez_compressed(file, **entries)
 
 
 def read_fit(path: str | os.PathLike[str]) -> SavedFit:

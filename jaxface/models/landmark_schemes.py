@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Float
+from jaxface.imaging.masks import FACE_OVAL_468
 
 SCHEME_SIZES = {"ibug68": 68, "mediapipe468": 468}
 """number of points of each scheme"""
 
+FACE_OVAL = FACE_OVAL_468
+"""outline of the face (of the 468), clockwise as seen from the top"""
 JAW_68 = range(0, 17)
 """of the 68: the contour, which moves over the surface as the head turns"""
 INNER_68 = range(17, 68)
@@ -40,12 +43,6 @@ _PAIRS = (
     (78, 78, 1), (81, 82, .50), (13, 13, 1), (312, 311, .50),
     (308, 308, 1), (317, 402, .50), (14, 14, 1), (87, 178, .50),
 )
-
-FACE_OVAL = (
-    10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377,
-    152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109,
-)
-"""outline of the face (of the 468), clockwise as seen from the top"""
 
 LIPS_OUTER = (
     61, 185, 40, 39, 37, 0, 267, 269, 270, 409, 291, 375, 321, 405, 314, 17, 84, 181, 91, 146,

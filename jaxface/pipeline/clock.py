@@ -3,13 +3,16 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import PyTree
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @dataclass
@@ -29,7 +32,7 @@ class Clock:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - ready
         return answer
 
-    def host(self, name: str, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    def host(self, name: str, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Call a function of the host and time it."""
         start = time.perf_counter()
         answer = function(*args, **options)

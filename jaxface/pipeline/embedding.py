@@ -195,7 +195,8 @@ def _closest_weights(
     det = np.maximum(g11 * g22 - g12 * g12, 1e-12)
     w1, w2 = (g22 * r1 - g12 * r2) / det, (g11 * r2 - g12 * r1) / det
     inside = np.stack([1 - w1 - w2, w1, w2], axis=1)
-    candidates = [np.where((inside >= 0).all(axis=1)[:, None], inside, np.nan)]
+    within = np.all(inside >= 0, axis=1, keepdims=True)
+    candidates = [np.where(within, inside, np.nan)]
     for start, end, i, j in ((a, b, 0, 1), (b, c, 1, 2), (c, a, 2, 0)):
         edge = end - start
         t = np.sum((p - start) * edge, axis=1) / np.maximum(np.sum(edge * edge, axis=1), 1e-12)

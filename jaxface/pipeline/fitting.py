@@ -252,7 +252,7 @@ def fit(
             landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
     landmarks = np.asarray(landmarks, np.float64)[:, :2]
     models = clock.host("prepare model", detail_levels, model, len(landmarks), len(steps), details)
-    linear = np.asarray(srgb_to_linear(seen.pixels))
+    linear = np.asarray(srgb_to_linear(jnp.asarray(seen.pixels)))
     focal = None
     if seen.focal_35mm:
         focal = seen.focal_35mm / 36.0 * max(linear.shape[:2])

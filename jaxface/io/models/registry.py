@@ -1,5 +1,6 @@
 """Finding a model by name or file, and describing what was found."""
 
+import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,7 @@ _BY_SUFFIX: dict[str, Callable[..., MorphableModel]] = {
 }
 
 
-def load_model(name_or_path: str | Path = "makehuman", **options: Any) -> MorphableModel:
+def load_model(name_or_path: str | os.PathLike[str] = "makehuman", **options: Any) -> MorphableModel:
     """A bundled model by name, or any supported file or folder by path.
 
     ``.mat`` is the Basel Face Model 2009, ``.h5`` that of 2017 or 2019, ``.pkl`` FLAME, ``.bin``

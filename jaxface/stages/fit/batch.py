@@ -1,6 +1,7 @@
 """Many photos at once: the fit under vmap, spread over devices."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ def fit_batch(
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> tuple[FaceParameters, FitStats]:
     """Fit several working images of one size, split evenly over the devices.
 
@@ -35,7 +36,7 @@ def fit_batch(
         models: level of detail for each pyramid level, as for ``fit_parameters``.
         weights: term weights.
         config: settings.
-        devices: where to run; all devices of the default backend if not given.
+        devices: the `jax.Device`s to run on; all devices of the default backend if not given.
 
     Returns:
         Parameters and history with a leading batch axis.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxface._types import Array, Bool, Int
 from jaxface.geometry.mesh import boundary_vertices
 from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
+from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 
 FACE_REGIONS = ("forehead", "temples", "nose", "cheeks", "chin", "lips", "eyelids", "face")
@@ -14,15 +15,6 @@ FACE_REGIONS = ("forehead", "temples", "nose", "cheeks", "chin", "lips", "eyelid
 
 OUTLINE_REGIONS = (*FACE_REGIONS, "neck", "ears")
 """skin that may form the outline of the face"""
-
-IBUG_CONTOUR = tuple(range(17))
-"""the jaw line among the 68 points"""
-
-MEDIAPIPE_CONTOUR = (
-    10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377,
-    152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109,
-)  # fmt: skip
-"""the face oval among the 468 points"""
 
 
 class FitModel(eqx.Module):
@@ -61,7 +53,7 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
             f"model {model.name!r} has no correspondences for {landmark_count} landmarks (it has "
             f"them for {known or 'none'}); run `jaxface model embed-landmarks` to find them"
         )
-    contour = IBUG_CONTOUR if landmark_count == 68 else MEDIAPIPE_CONTOUR
+    contour = JAW_68 if landmark_count == 68 else FACE_OVAL
     faces = np.asarray(model.faces)
     skin = _in_regions(model, FACE_REGIONS)
     outline = _in_regions(model, OUTLINE_REGIONS)
@@ -70,7 +62,7 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
         model=model,
         stencil=normal_stencil(faces, model.vertex_count),
         points=points,
-        contour=jnp.asarray(contour, jnp.int32),
+        contour=jnp.array(contour, jnp.int32),
         outline=jnp.asarray(np.flatnonzero(outline), jnp.int32),
         vertex_mask=jnp.asarray(skin),
         face_mask=jnp.asarray(skin[faces].all(axis=1)),
