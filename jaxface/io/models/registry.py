@@ -27,7 +27,9 @@ _BY_SUFFIX: dict[str, Callable[..., MorphableModel]] = {
 }
 
 
-def load_model(name_or_path: str | os.PathLike[str] = "makehuman", **options: Any) -> MorphableModel:
+def load_model(
+    name_or_path: str | os.PathLike[str] = "makehuman", **options: Any
+) -> MorphableModel:
     """A bundled model by name, or any supported file or folder by path.
 
     ``.mat`` is the Basel Face Model 2009, ``.h5`` that of 2017 or 2019, ``.pkl`` FLAME, ``.bin``
