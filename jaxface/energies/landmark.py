@@ -11,8 +11,12 @@ import jax.numpy as jnp
 from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
+
+GRAZING = (0.1, 0.5)
+"""cosines of the angle to the view at which a landmark does not count, and counts fully"""
 
 
 class LandmarkData(eqx.Module):
@@ -60,12 +64,14 @@ def slide_contour(
     candidates: Int[Array, "c"],
     reach: float = 0.35,
 ) -> LandmarkData:
-    """Move hidden contour landmarks to the silhouette.
+    """Keep to the landmarks that can be seen, and move hidden contour points to the silhouette.
 
-    A detector places jaw points on the outline it sees. Once the head turns, the outline is not
-    where the frontal jaw was: a contour landmark whose own surface point faces away from the
-    camera is attached to the candidate vertex on the silhouette that is nearest to its detected
-    position, and loses its weight if none lies within ``reach`` units.
+    Where the surface turns away a detector guesses: landmarks off the contour lose their weight
+    between the two cosines of ``GRAZING``. Contour points it places on the outline it sees, and
+    once the head turns the outline is not where the frontal jaw was: a contour landmark whose
+    own surface point faces away from the camera is attached to the candidate vertex on the
+    silhouette that is nearest to its detected position, and loses its weight if none lies within
+    ``reach`` units.
 
     Args:
         y: current estimate, held fixed (the choice is discrete; no gradient passes).
@@ -81,8 +87,8 @@ def slide_contour(
     posed = vertices @ rotation.T + y.translation
     view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
     facing = jnp.sum(normals * view, axis=-1)
-    at_contour = SurfacePoints(data.points.vertices[contour], data.points.weights[contour])
-    hidden = at_contour(facing[:, None])[:, 0] < 0.05
+    own_facing = data.points(facing[:, None])[:, 0]
+    hidden = own_facing[contour] < 0.05
 
     screen = y.camera(data.principal).project(posed[candidates])[:, :2]
     target = data.target[contour]
@@ -91,6 +97,7 @@ def slide_contour(
     distance = jnp.where(on_silhouette[None], distance, jnp.inf)
     nearest = jnp.argmin(distance, axis=1)
     near = jnp.min(distance, axis=1) < reach
+    at_contour = SurfacePoints(data.points.vertices[contour], data.points.weights[contour])
     slid = jnp.broadcast_to(candidates[nearest][:, None], at_contour.vertices.shape)
     moved = (hidden & near)[:, None]
     corner = jnp.array([1.0, 0.0, 0.0], model.mean.dtype)
@@ -98,5 +105,7 @@ def slide_contour(
         data.points.vertices.at[contour].set(jnp.where(moved, slid, at_contour.vertices)),
         data.points.weights.at[contour].set(jnp.where(moved, corner, at_contour.weights)),
     )
-    weight = data.weight.at[contour].multiply(jnp.where(hidden & ~near, 0.0, 1.0))
+    seen = smoothstep(own_facing, *GRAZING)
+    seen = seen.at[contour].set(jnp.where(hidden, jnp.where(near, 1.0, 0.0), 1.0))
+    weight = data.weight * seen
     return eqx.tree_at(lambda d: (d.points, d.weight), data, (points, weight))

@@ -11,8 +11,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_norm
 from jaxface._types import Array, Float
-from jaxface.energies.landmark import LandmarkData, landmark_residual, slide_contour
+from jaxface.energies.landmark import (
+    LandmarkData,
+    landmark_difference,
+    landmark_residual,
+    slide_contour,
+)
 from jaxface.energies.photometric import (
     PhotometricData,
     PixelSamples,
@@ -23,7 +29,7 @@ from jaxface.energies.photometric import (
 )
 from jaxface.energies.photometric_quadratic import normal_modes, photometric_quadratic
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
-from jaxface.energies.term import Energy, Term, compose
+from jaxface.energies.term import Energy, Quadratic, Term, compose
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.pose import pose_from_landmarks
 from jaxface.geometry.rotation import rotation_matrix
@@ -43,6 +49,13 @@ class FitWeights(eqx.Module):
     photo: float | Array = 1.0
     landmark: float | Array = 10.0
     prior: float | Array = 2.5e-5
+    noise: float | Array = 0.03
+    """``E_c`` (linear RGB, face at median 0.5) at which the photo term has its own weight: it
+    counts ``noise / E_c``, the more the better the model explains the photo; 0 gives the paper's
+    constant weight"""
+    landmark_scale: float | Array = 0.025
+    """distance (of the eye distance) at which a landmark counts half, as an outlier does; 0
+    gives the paper's plain squares"""
     focal: float | Array = 2.5e-5
     """of the prior on the focal length (not in the paper)"""
     light: float | Array = 2.5e-5
@@ -88,6 +101,8 @@ class FitData(eqx.Module):
     """What one Gauss-Newton step holds fixed: visible pixels, landmarks, priors."""
 
     photo: PhotometricData
+    photo_trust: Float[Array, ""]
+    """``noise / E_c``: a Laplacian of unknown width has ``log E_c`` for its likelihood"""
     curvature_samples: PixelSamples
     landmark: LandmarkData
     normal_modes: Float[Array, "n 3 k"]
@@ -110,18 +125,21 @@ def fit_energy(weights: FitWeights, extra_terms: Sequence[Term] = ()) -> Energy:
     """Equation 1 of Saito 2017 as composed terms of ``(FaceParameters, FitData)``."""
     return compose(
         [
-            Term(
-                "photo",
-                lambda y, d: photometric_energy(y, d.photo),
-                weights.photo,
-                "scalar",
-                lambda y, d: photometric_quadratic(y, d.photo, d.normal_modes, d.curvature_samples),
-            ),
+            Term("photo", _photo_value, weights.photo, "scalar", _photo_quadratic),
             *_geometric_terms(weights),
             Term("light", lambda y, d: light_residual(y), weights.light),
             *extra_terms,
         ]
     )
+
+
+def _photo_value(y: FaceParameters, data: FitData) -> Float[Array, ""]:
+    return data.photo_trust * photometric_energy(y, data.photo)
+
+
+def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
+    model = photometric_quadratic(y, data.photo, data.normal_modes, data.curvature_samples)
+    return jax.tree.map(lambda x: data.photo_trust * x, model)
 
 
 def _geometric_terms(weights: FitWeights) -> list[Term]:
@@ -163,7 +181,7 @@ def fit_parameters(
             refresh=lambda y, args: observe(y, *args, curvature_pixels=config.curvature_pixels),
         )
         modes = normal_modes(y, model.model, model.stencil)
-        args = (image, mask, data, model, modes)
+        args = (image, mask, data, model, modes, weights)
         solution = gauss_newton(problem, y, args, steps=steps, rtol=config.rtol)
         y = solution.value
         histories.append(solution.stats["history"])
@@ -179,6 +197,7 @@ def observe(
     data: FitInput,
     model: FitModel,
     modes: Float[Array, "n 3 k"],
+    weights: FitWeights,
     *,
     curvature_pixels: int,
 ) -> FitData:
@@ -194,13 +213,23 @@ def observe(
     samples = sample_pixels(
         image, mask, triangle, faces, model.face_mask, data.principal, size * size // 2
     )
-    inlier = inlier_weights(samples.color, synthesize(y, model.model, samples), samples.weight)
+    synth = synthesize(y, model.model, samples)
+    inlier = inlier_weights(samples.color, synth, samples.weight)
     inlier = jnp.where(data.estimate_inliers, inlier, 1.0)
     samples = eqx.tree_at(lambda s: s.weight, samples, samples.weight * inlier)
+    misfit = jnp.sum(samples.weight * safe_norm(samples.color - synth))
+    misfit = misfit / jnp.maximum(jnp.sum(samples.weight), 1.0)
+    trust = weights.noise / jnp.maximum(misfit, 0.2 * weights.noise + 1e-9)
+    landmark = slide_contour(y, landmark_data(data, model), model.contour, model.outline)
+    distance = safe_norm(landmark_difference(y, landmark)) / landmark.unit
+    scale = jnp.asarray(weights.landmark_scale, distance.dtype)
+    outlier = jnp.where(scale > 0, distance / jnp.where(scale > 0, scale, 1.0), 0.0)
+    robust = landmark.weight / (1.0 + outlier**2)
     return FitData(
         photo=PhotometricData(model.model, samples),
+        photo_trust=jnp.where(weights.noise > 0, trust, 1.0),
         curvature_samples=thin_samples(samples, curvature_pixels),
-        landmark=slide_contour(y, landmark_data(data, model), model.contour, model.outline),
+        landmark=eqx.tree_at(lambda d: d.weight, landmark, robust),
         normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
     )
