@@ -3,10 +3,10 @@
     python benchmarks/rasterize.py
 
 Each line draws the same mesh to the same pixels. ``scatter-min`` is the textbook way in an array
-language: every triangle gets a fixed window of pixels as large as the mesh's largest triangle,
-all fragments are made at once, scattered by depth, then by index. ``embree`` (with the
-``embreex`` and ``trimesh`` packages installed) casts one ray a pixel through a tree that is
-built anew for each pose, as a fit needs it.
+language: every triangle gets a window of pixels as large as the mesh's largest bounding box
+(left out beyond 64), all fragments are made at once, scattered by depth, then by index.
+``embree`` (with the ``embreex`` and ``trimesh`` packages installed) casts one ray a pixel through
+a tree that is built anew for each pose, as a fit needs it.
 
 ``floor`` is the time to touch the data once at the measured speed of a copy and of a scatter:
 corners of every triangle read, every covered fragment scattered twice, the image written.
@@ -64,11 +64,11 @@ def framed(vertices, size, fill=0.55):
 
 @partial(jax.jit, static_argnames=("size", "window"))
 def scatter_min(screen, faces, size, window):
-    """The baseline: a window of ``window``^2 fragments for every triangle."""
+    """The baseline: a window of (rows, columns) fragments for every triangle."""
     x, y, z = (tuple(screen[faces[:, i], k] for i in range(3)) for k in range(3))
     left, top, columns, rows = pixel_block(x, y, jnp.minimum(*z[:2]) > 0, size, size)
-    place = jnp.arange(window * window, dtype=jnp.int32)[:, None]
-    c, r = place % window, place // window
+    place = jnp.arange(window[0] * window[1], dtype=jnp.int32)[:, None]
+    c, r = place % window[1], place // window[1]
     cx, cy = (left + c) + 0.5, (top + r) + 0.5
     sides = []
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -146,14 +146,17 @@ def compare(bench, name, vertices, faces, size):
     )  # fmt: skip
     culled = jax.jit(lambda s: rasterize(s, faces_j, size, size, cull=True))
     bench.time(f"{name}: rasterize, culled", culled, screen)
-    spread = jnp.ptp(screen[faces_j][..., :2], axis=1)
-    window = int(jnp.ceil(jnp.max(spread))) + 1
-    if window <= 16:
-        same = {"same triangle": 0.0, "window": window}
+    x, y = (tuple(screen[faces_j[:, i], k] for i in range(3)) for k in range(2))
+    *_, columns, rows = pixel_block(x, y, jnp.ones(len(faces), bool), size, size)
+    window = int(rows.max()), int(columns.max())
+    if window[0] * window[1] <= 64:
         bench.time(
             f"{name}: rasterize", scatter_min, screen, faces_j, size, window,
             program="scatter-min",
-            values=lambda f: same | {"same triangle": agreement(f.triangle, fragments.triangle)},
+            values=lambda f: {
+                "same triangle": agreement(f.triangle, fragments.triangle),
+                "window": window[0] * window[1],
+            },
         )  # fmt: skip
     cast = embree(vertices, faces, pose, camera, size)
     if cast is not None:

@@ -7,7 +7,7 @@ weights from there. So gradients are those of a picture whose visibility is fixe
 exact inside a silhouette and know nothing of a silhouette's motion.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -116,7 +116,7 @@ def rasterize(
     return Fragments(triangle, weights, depth)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _nearest(height: int, width: int, cull: bool, near: float):
     """``nearest_triangles`` of one scene, under ``vmap`` of all the batch's scenes as one.
 

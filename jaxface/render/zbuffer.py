@@ -103,7 +103,7 @@ def nearest_triangles(
     # Few-fragment tiles first: a batch takes as many rounds as its fullest tile.
     large = (columns > wide) | (rows > high)
     few = ~large & (jax.lax.population_count(rest) <= ROUNDS)
-    first, second = _running_count(few & (rest != 0)), _running_count(~few)
+    first, second = _running_count(jnp.stack([few & (rest != 0), ~few]))
     length = first[-1] + second[-1]
     place = jnp.where(few, jnp.where(rest != 0, first - 1, length), first[-1] + second - 1)
     place = jnp.where(place < length, place, scenes * count + batch)
@@ -114,10 +114,10 @@ def nearest_triangles(
         window = jax.lax.dynamic_slice(queue, (cursor,), (batch,))
         slot = jnp.arange(batch, dtype=jnp.int32)
         box = jax.tree.map(lambda v: v[window], tiles)
-        across = -(-box.columns // box.wide)
-        high = TILE_PIXELS // box.wide
-        skip = jnp.where(rest[window] != 0, 0, 1)
-        wanted = across * -(-box.rows // high) - skip
+        high = jax.lax.div(TILE_PIXELS, box.wide)
+        across = jax.lax.div(box.columns + box.wide - 1, box.wide)
+        skip = (rest[window] == 0).astype(jnp.int32)
+        wanted = across * jax.lax.div(box.rows + high - 1, high) - skip
         left_over = jnp.where(cursor + slot < length, wanted, 0).at[0].add(-done)
         left_over = jnp.minimum(left_over, batch + 1)  # so that the sum cannot overflow
         ends = jnp.cumsum(left_over, dtype=jnp.int32)
@@ -128,8 +128,8 @@ def nearest_triangles(
         live = slot < ends[-1]
         tile = slot - starts[owner] + jnp.where(owner == 0, done, 0) + skip[owner]
         here = jax.tree.map(lambda v: v[window[owner]], tiles)
-        shift_x = tile % jnp.maximum(across[owner], 1) * here.wide
-        shift_y = tile // jnp.maximum(across[owner], 1) * high[owner]
+        shift_x = jax.lax.rem(tile, jnp.maximum(across[owner], 1)) * here.wide
+        shift_y = jax.lax.div(tile, jnp.maximum(across[owner], 1)) * high[owner]
         here = here._replace(
             left=here.left + shift_x,
             top=here.top + shift_y,
@@ -152,17 +152,18 @@ def _bits(tiles: Tiles, cull: bool) -> Int[Array, "t"]:
     return tile_bits(tiles.x, tiles.y, *tiles[3:8], cull)
 
 
-def _running_count(flags: Bool[Array, "t"]) -> Int[Array, "t"]:
+def _running_count(flags: Bool[Array, "k t"]) -> Int[Array, "k t"]:
     """How many flags are set up to and with each: a prefix sum in two levels.
 
     Blocks are summed by a triangular matrix, since XLA's own prefix sum takes longer on a CPU than
     all the drawing; zeros and ones are exact in any precision of multiplication.
     """
-    blocks = jnp.pad(flags, (0, -flags.size % 128)).reshape(-1, 128).astype(jnp.float32)
-    inner = blocks @ jnp.triu(jnp.ones((128, 128), jnp.float32))
-    inner = inner.astype(jnp.int32)
-    before = jnp.cumsum(inner[:, -1], dtype=jnp.int32) - inner[:, -1]
-    return (inner + before[:, None]).reshape(-1)[: flags.size]
+    rows, size = flags.shape
+    blocks = jnp.pad(flags, ((0, 0), (0, -size % 128))).reshape(rows, -1, 128)
+    within = blocks.astype(jnp.float32) @ jnp.triu(jnp.ones((128, 128), jnp.float32))
+    within = within.astype(jnp.int32)
+    before = jnp.cumsum(within[..., -1], axis=1, dtype=jnp.int32) - within[..., -1]
+    return (within + before[..., None]).reshape(rows, -1)[:, :size]
 
 
 def _draw(
