@@ -1,0 +1,141 @@
+"""The image formation and the fit against faces that an independent renderer photographed."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fit_metrics import (
+    aligned_distances,
+    compare,
+    face_region,
+    load_truth,
+    projected_landmarks,
+    relative_error,
+    rotation_angle,
+)
+from ground_truth import model_digest
+from photo_fit import fit_photo
+from PIL import Image
+
+from jaxface._numerics import safe_normalize
+from jaxface.geometry.camera import Camera
+from jaxface.geometry.mesh import vertex_normals
+from jaxface.geometry.rotation import rotation_matrix
+from jaxface.imaging.colour import srgb_to_linear
+from jaxface.io.models import load_model
+from jaxface.models.landmark_schemes import landmarks68
+from jaxface.models.subdivide import subdivide
+from jaxface.render.interpolate import interpolate
+from jaxface.render.rasterize import rasterize
+from jaxface.render.shading import irradiance, sh_basis
+from jaxface.stages.landmarks import detect_one
+
+FOLDER = Path(__file__).parent / "data" / "ground_truth"
+NAMES = sorted(path.stem for path in FOLDER.glob("*.npz"))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model("makehuman")
+
+
+@pytest.fixture(scope="module")
+def fine(model):
+    return subdivide(model, 1)
+
+
+@pytest.fixture(params=NAMES)
+def face(request, fine):
+    truth = load_truth(FOLDER / f"{request.param}.npz")
+    if str(truth["digest"]) != model_digest(fine):
+        pytest.fail("the bundled model has changed: make tests/data/ground_truth anew (README.md)")
+    with Image.open(FOLDER / f"{request.param}.jpg") as picture:
+        return np.asarray(picture.convert("RGB")), truth
+
+
+def test_there_are_faces():
+    assert len(NAMES) == 2
+
+
+def test_we_render_what_the_other_renderer_saw(face, fine):
+    """True parameters through our camera, rasteriser and shading give the photo.
+
+    The photo has cast shadows, bounces and JPEG; second-order light has none of them. Where a
+    vertex lands, which triangle is in front and which way light falls show up as far larger
+    differences than these bounds.
+    """
+    photo, truth = face
+    size = photo.shape[0]
+    rotation = jnp.asarray(truth["rotation"])
+    shape = fine.shape(jnp.asarray(truth["identity"]), jnp.asarray(truth["expression"]))
+    camera = Camera(jnp.asarray(truth["focal"]), jnp.asarray(truth["principal"]))
+    screen = camera.project(shape @ rotation.T + truth["translation"])
+    fragments = rasterize(screen, fine.faces, size, size)
+    light = np.linalg.lstsq(
+        np.asarray(sh_basis(truth["sphere_normals"])),
+        truth["sphere_irradiance"] / np.pi,
+        rcond=None,
+    )[0]
+    albedo = fine.reflectance(jnp.asarray(truth["albedo_coefficients"]))
+    values = jnp.concatenate([vertex_normals(shape, fine.faces) @ rotation.T, albedo], axis=1)
+    at_pixel = interpolate(values, fine.faces, fragments)
+    normal = safe_normalize(at_pixel[..., :3])
+    ours = np.asarray(at_pixel[..., 3:] * irradiance(normal, jnp.asarray(light)))
+    theirs = np.asarray(srgb_to_linear(photo / np.float32(255)))
+
+    triangle = np.asarray(fragments.triangle)
+    in_region = np.zeros(fine.vertex_count, bool)
+    in_region[face_region(fine)] = True
+    skin = (triangle >= 0) & in_region[np.asarray(fine.faces)[triangle]].all(axis=-1)
+    skin &= (photo > 3).all(axis=-1) & (photo < 252).all(axis=-1)
+    assert skin.sum() > 5000
+    difference = np.abs(ours - theirs)[skin] / theirs[skin].mean()
+    assert np.median(difference) < 0.04
+    shifted = np.abs(np.roll(ours, 6, axis=1) - theirs)[skin] / theirs[skin].mean()
+    assert np.mean(difference) < 0.7 * np.mean(shifted)
+
+
+def test_detected_landmarks_are_where_the_model_has_them(face, fine):
+    photo, truth = face
+    found = np.asarray(landmarks68(jnp.asarray(detect_one(photo).landmarks, jnp.float32)))[:, :2]
+    true = projected_landmarks(truth, fine)
+    gap = np.linalg.norm(found - true, axis=1)[17:].mean() / np.linalg.norm(true[36] - true[45])
+    assert gap < 0.04
+
+
+@pytest.mark.slow
+def test_a_fit_from_detected_landmarks_finds_the_face(face, model, fine):
+    photo, truth = face
+    estimate = fit_photo(photo, model)
+    figures = compare(estimate, truth, fine, face_region(fine))
+    assert figures["median"] < 1.2
+    assert figures["ratio"] < 0.6
+    assert figures["albedo"] < figures["mean_albedo"]
+    assert figures["light"] < 0.5 * figures["ambient_light"]
+    assert figures["landmarks_fit_to_detected"] < 2.5
+    assert figures["identity_rms"] < 1.5
+
+
+def test_alignment_ignores_a_similarity_and_nothing_else():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 3)) * 50
+    rotation = np.asarray(rotation_matrix(jnp.array([0.3, -0.5, 0.2])))
+    moved = 1.3 * points @ rotation.T + [5.0, -80.0, 600.0]
+    assert aligned_distances(moved, points).max() < 1e-2
+    bumped = points.copy()
+    bumped[0] += [0.0, 0.0, 10.0]
+    distance = aligned_distances(bumped, points)
+    assert distance.argmax() == 0 and distance[0] > 9
+    assert rotation_angle(rotation, np.eye(3)) == pytest.approx(
+        np.rad2deg(np.linalg.norm([0.3, -0.5, 0.2])), abs=1e-2
+    )
+
+
+def test_relative_error_ignores_scale_but_not_hue_unless_asked():
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(0.1, 0.9, (50, 3))
+    assert relative_error(0.2 * truth, truth, False) < 1e-6
+    tinted = truth * [1.0, 0.5, 0.8]
+    assert relative_error(tinted, truth, False) > 0.1
+    assert relative_error(tinted, truth, True) < 1e-6
