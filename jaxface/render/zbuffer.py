@@ -114,7 +114,7 @@ def nearest_triangles(
         window = jax.lax.dynamic_slice(queue, (cursor,), (batch,))
         slot = jnp.arange(batch, dtype=jnp.int32)
         box = jax.tree.map(lambda v: v[window], tiles)
-        high = jax.lax.div(TILE_PIXELS, box.wide)
+        high = jax.lax.div(jnp.full_like(box.wide, TILE_PIXELS), box.wide)
         across = jax.lax.div(box.columns + box.wide - 1, box.wide)
         skip = (rest[window] == 0).astype(jnp.int32)
         wanted = across * jax.lax.div(box.rows + high - 1, high) - skip
