@@ -1,5 +1,7 @@
 """Rotation, camera, closed-form pose and alignment."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,9 @@ from jaxface.geometry.rotation import (
     rotation_matrix,
     similarity_transform,
 )
+
+many_sweeps = jax.jit(partial(pose_from_landmarks, sweeps=20))
+few_sweeps = jax.jit(pose_from_landmarks)
 
 ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3)
 
@@ -37,10 +42,14 @@ def test_axis_angle_inverts(vector):
     np.testing.assert_allclose(again, matrix, atol=1e-9)
 
 
+forward_jacobian = jax.jit(jax.jacfwd(rotation_matrix))
+reverse_jacobian = jax.jit(jax.jacrev(rotation_matrix))
+
+
 @pytest.mark.parametrize("scale", [0.0, 1e-8, 1e-3, 0.0316, 1.0, np.pi])
 def test_rotation_derivative_in_both_modes(x64, scale):
     vector = scale * jnp.array([0.6, -0.64, 0.48])
-    forward, reverse = jax.jacfwd(rotation_matrix)(vector), jax.jacrev(rotation_matrix)(vector)
+    forward, reverse = forward_jacobian(vector), reverse_jacobian(vector)
     np.testing.assert_allclose(forward, reverse, atol=1e-12)
     step = 1e-6
     for axis, e in enumerate(jnp.eye(3)):
@@ -89,7 +98,7 @@ def test_edge_on_triangle_is_finite(x64):
         return jnp.sum(ray_weights(jnp.array([[0.1, 0.0, -1.0]]), c) ** 2)
 
     assert float(total(corners)) == 1.0
-    assert not np.asarray(jax.grad(total)(corners)).any()
+    assert not np.asarray(jax.jit(jax.grad(total))(corners)).any()
 
 
 @given(st.floats(-0.7, 0.7), st.floats(-0.4, 0.4), st.floats(-3.0, 3.0), st.floats(400, 2000))
@@ -100,13 +109,11 @@ def test_pose_from_landmarks_recovers_a_perspective_pose(yaw, pitch, roll, dista
         pose = Pose(jnp.asarray(turn.as_rotvec()), jnp.array([20.0, -30.0, -distance]))
         camera = Camera(jnp.asarray(2.0), jnp.array([0.45, 0.55]))
         target = camera.project(pose(jnp.asarray(points)))[:, :2]
-        rotation, translation = pose_from_landmarks(
-            jnp.asarray(points), target, jnp.ones(30), camera.focal, camera.principal, sweeps=20
-        )
-        again = camera.project(Pose(rotation, translation)(jnp.asarray(points)))[:, :2]
-        few = pose_from_landmarks(
+        rotation, translation = many_sweeps(
             jnp.asarray(points), target, jnp.ones(30), camera.focal, camera.principal
         )
+        again = camera.project(Pose(rotation, translation)(jnp.asarray(points)))[:, :2]
+        few = few_sweeps(jnp.asarray(points), target, jnp.ones(30), camera.focal, camera.principal)
     np.testing.assert_allclose(again, target, atol=2e-4)
     turned = scipy.spatial.transform.Rotation.from_rotvec(np.array(few[0]))
     assert np.degrees((turned * turn.inv()).magnitude()) < 8
