@@ -1,5 +1,6 @@
 """The fit on pictures of the bundled model, whose answer is known."""
 
+import os
 import subprocess
 import sys
 
@@ -27,6 +28,8 @@ from jaxface.stages.fit.inliers import inlier_weights
 STEPS = (8, 3)
 SIZE = 128
 
+draw = jax.jit(render_fit, static_argnums=3)
+
 
 @pytest.fixture(scope="module")
 def model():
@@ -50,7 +53,7 @@ def known(model):
         log_focal=jnp.asarray(np.log(2.6), jnp.float32),
     )
     principal = jnp.array([0.5, 0.5])
-    shown = jax.jit(render_fit, static_argnums=3)(y, prepared, principal, 256)
+    shown = draw(y, prepared, principal, 256)
     shape = model.shape(y.identity, y.expression)
     points = y.camera(principal, 256).project(y.pose(prepared.points(shape)))[:, :2]
     covered = np.asarray(shown.fragments.triangle) >= 0
@@ -93,7 +96,7 @@ def test_recovers_the_shape(model, known, fitted):
 
 def test_recovers_the_picture(known, fitted):
     working, models, _, y, _ = fitted
-    shown = render_fit(y, models[-1], working.data.principal, SIZE)
+    shown = draw(y, models[-1], working.data.principal, SIZE)
     skin = np.asarray(shown.skin) & (np.asarray(working.data.mask) > 0.5)
     residual = np.linalg.norm(np.asarray(shown.color - working.data.image), axis=-1)[skin]
     assert np.median(residual) < 0.05
@@ -111,7 +114,7 @@ def test_energy_falls_within_every_level(fitted):
 
 def test_posterior_shrinks_what_the_photo_shows(model, fitted):
     stats = fitted[4]
-    spread = posterior(stats.curvature, model, FitWeights().prior)
+    spread = jax.jit(posterior)(stats.curvature, model, FitWeights().prior)
     k = model.identity.count + model.expression.count + model.albedo.count
     deviation = np.sqrt(np.diag(np.asarray(spread.covariance))[:k])
     assert (deviation < 1.02).all(), "a photo cannot make a coefficient less certain than its prior"
@@ -130,6 +133,7 @@ def test_exposure_does_not_matter(model, known):
     assert dark.gain == pytest.approx(10 * bright.gain, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_batch_equals_one_by_one(known, fitted):
     working, models, config, y, _ = fitted
     mirrored = working.data
@@ -173,8 +177,6 @@ one = fit_batch(inputs[:1], (fm,), FitWeights(), FitConfig(steps=(2,), landmark_
 np.testing.assert_allclose(p.identity[0], one.identity[0], atol=1e-2)
 print("spread over", len(jax.devices()))
 """
-    import os
-
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, env=environment
