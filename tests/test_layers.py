@@ -46,6 +46,7 @@ RESTRICTED = {
     "PIL": {"io"},
     "pygltflib": {"io"},
     "h5py": {"io"},
+    "tifffile": {"io"},
     # peers: measured against in benchmarks and tests, never a dependency
     "torch": set(),
     "tensorflow": set(),
