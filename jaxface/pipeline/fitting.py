@@ -13,9 +13,10 @@ import numpy as np
 from jaxface._types import Array, Float
 from jaxface.energies.term import Term
 from jaxface.imaging.colour import srgb_to_linear
+from jaxface.imaging.masks import dilate, fill_polygon
 from jaxface.io.image import Photo, read_image
 from jaxface.io.models import load_model
-from jaxface.models.landmark_schemes import landmarks68
+from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.models.subdivide import subdivide
@@ -114,6 +115,16 @@ class FittedFace:
 @functools.cache
 def _fit_program() -> Any:
     return jax.jit(fit_parameters, compiler_options=quick_compilation())
+
+
+@functools.cache
+def _brow_program(size: int) -> Any:
+    def inside(points: Float[Array, "468 2"]) -> Array:
+        lines = [points[jnp.asarray(CONTOURS[f"{side} brow"])] for side in ("left", "right")]
+        filled = [fill_polygon(line, size, size) for line in lines]
+        return dilate(filled[0] | filled[1], size / 50)
+
+    return jax.jit(inside)
 
 
 @functools.cache

@@ -208,6 +208,9 @@ def gauss_newton(
         there was none).
     """
 
+    # Each is traced in several places (shapes, closure conversion, the step): jit traces once.
+    problem = Problem(*(jax.jit(part) for part in problem))
+
     def fn(y, args):
         data = problem.refresh(jax.lax.stop_gradient(y), args)
         return problem.energy(y, data)
