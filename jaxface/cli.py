@@ -47,7 +47,7 @@ WeightsOption = Annotated[
     str | None,
     typer.Option(
         "--weights",
-        help="Term weights that differ from the paper's, as photo=1,landmark=10,prior=2.5e-5.",
+        help="Term weights that differ from the defaults, as photo=1,landmark=10,prior=2.5e-5.",
     ),
 ]
 SizeOption = Annotated[int, typer.Option("--size", help="Side of the working image, px.")]

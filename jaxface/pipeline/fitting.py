@@ -165,7 +165,7 @@ def detail_levels(
 
 
 def parse_weights(text: str) -> FitWeights:
-    """Weights from text such as ``landmark=20,prior=1e-5``; the others stay the paper's.
+    """Weights from text such as ``landmark=20,prior=1e-5``; the others keep their defaults.
 
     Raises:
         ValueError: an unknown term, or a value that is not a finite number of 0 or more.
@@ -235,7 +235,7 @@ def fit(
         mask: (h, w) valid face pixels; by default the face oval less what is not skin.
         face: which face, from the largest (0), where the photo shows several.
         detector: ``detector(pixels, face)`` with an answer that has ``landmarks`` (468, 2 or 3).
-        weights: of the terms; the paper's by default.
+        weights: of the terms; `FitWeights()` by default.
         steps: Gauss-Newton steps on each pyramid level, coarsest first.
         size: side of the working image, px.
         details: subdivisions of the model at each level (``detail_levels``).
