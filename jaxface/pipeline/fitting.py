@@ -107,9 +107,14 @@ class FittedFace:
         data = self.working.data
         if not bool(data.estimate_inliers):
             return np.asarray(data.mask)
-        return np.asarray(
-            self.clock.run("skin", _skin_program, self.render(), data.image, data.mask)
-        )
+        rendered = self.render()
+        shown = self.clock.run("skin", _skin_program, rendered, data.image, data.mask)
+        if len(self.landmarks) != 468:
+            return np.asarray(shown)
+        # Brows differ from the model's more than any skin does, and yet belong to the face.
+        points = jnp.asarray(data.landmarks * self.size)
+        brows = _brow_program(self.size)(points) * data.mask * rendered.skin
+        return np.maximum(np.asarray(shown), np.asarray(brows))
 
 
 @functools.cache

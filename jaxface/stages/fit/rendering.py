@@ -55,12 +55,15 @@ def skin_map(
 ) -> Float[Array, "s s"]:
     """Pixels that show skin as the fit explains it: mask, less hair, hands and glasses.
 
-    The inlier weights of the fit on the rendered working image, averaged over 4x4 pixels and
-    steepened, so that the map has smooth borders and no single-pixel holes.
+    The inlier weights of the fit, with wider limits so that folds and beard stay, on the rendered
+    working image, averaged over 4x4 pixels and steepened, so that the map has smooth borders and
+    no single-pixel holes.
     """
     size = image.shape[0]
     weight = (mask * rendered.skin).reshape(-1)
-    inlier = inlier_weights(image.reshape(-1, 3), rendered.color.reshape(-1, 3), weight)
+    inlier = inlier_weights(
+        image.reshape(-1, 3), rendered.color.reshape(-1, 3), weight, accept=4.0, reject=6.0
+    )
     valid = (mask * rendered.skin)[..., None]
     shares = resize(
         jnp.concatenate([inlier.reshape(size, size, 1) * valid, valid], axis=-1),
