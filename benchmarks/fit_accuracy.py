@@ -14,7 +14,6 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import typer
 from fit_metrics import Estimate, compare, face_region, load_truth, sphere
@@ -23,6 +22,7 @@ from harness import RESULTS, provenance
 from photo_fit import fit_photo
 from PIL import Image
 
+from jaxface.io.cache import enable_compilation_cache
 from jaxface.io.drawing import draw_landmarks
 from jaxface.io.models import load_model
 from jaxface.io.overlay import contact_sheet
@@ -111,7 +111,7 @@ def main(
     sheet: Annotated[Path | None, typer.Option(help="contact sheet (PNG) to write")] = None,
 ) -> None:
     """Fit every photo of a folder and compare with the truth."""
-    jax.config.update("jax_enable_compilation_cache", False)
+    enable_compilation_cache()
     stems = sorted(p for p in folder.glob("*.npz") if only in p.stem)
     if not stems:
         raise typer.BadParameter(f"{folder} has no renders; make some with ground_truth.py")
