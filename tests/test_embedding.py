@@ -1,0 +1,48 @@
+"""Landmarks of a topology found by rendering it: against the bundled model's own."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxface.io.model_file import load_bundled
+from jaxface.pipeline.embedding import _closest_weights, embed_landmarks, with_landmarks
+
+
+@pytest.mark.slow
+def test_finds_the_bundled_landmarks_again():
+    model = load_bundled("makehuman")
+    bare = eqx.tree_at(lambda m: (m.landmarks68, m.landmarks468), model, (None, None))
+    found = embed_landmarks(bare, yaws=(-15.0, 0.0, 15.0))
+    assert found.views == 3
+    distance = np.linalg.norm(
+        np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1
+    )
+    assert np.median(distance) < 3.0
+    complete = with_landmarks(bare, found.points)
+    inner = np.asarray(complete.landmarks68(model.mean) - model.landmarks68(model.mean))[17:]
+    assert np.median(np.linalg.norm(inner, axis=1)) < 3.0
+
+
+@pytest.mark.slow
+def test_a_model_seen_from_behind_is_refused():
+    model = load_bundled("makehuman")
+    turned = model.mean * np.array([-1.0, 1.0, -1.0], np.float32)
+    with pytest.raises(ValueError, match="finds a face in 0 of 2"):
+        embed_landmarks(eqx.tree_at(lambda m: m.mean, model, turned), yaws=(0.0, 15.0))
+
+
+def test_closest_point_of_a_triangle_against_a_dense_search():
+    rng = np.random.default_rng(0)
+    corners = rng.normal(size=(6, 3, 3))
+    steps = np.linspace(0, 1, 60)
+    u, v = np.meshgrid(steps, steps)
+    inside = u + v <= 1
+    dense = np.stack([1 - u - v, u, v], axis=-1)[inside]
+    for place in rng.normal(size=(5, 3)) * 1.5:
+        weights = _closest_weights(place, *np.moveaxis(corners, 1, 0))
+        assert (weights >= -1e-9).all()
+        np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+        for triangle, w in zip(corners, weights, strict=True):
+            best = np.linalg.norm(dense @ triangle - place, axis=1).min()
+            assert np.linalg.norm(w @ triangle - place) <= best + 1e-9
+            assert np.linalg.norm(w @ triangle - place) >= best - 0.1
