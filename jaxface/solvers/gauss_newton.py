@@ -207,7 +207,6 @@ def gauss_newton(
         last factor; ``curvature``, (p, p), that of the last step's quadratic model (zero if
         there was none).
     """
-
     # Each is traced in several places (shapes, closure conversion, the step): jit traces once.
     problem = Problem(*(jax.jit(part) for part in problem))
 
