@@ -7,7 +7,7 @@ import numpy as np
 from jaxface._types import Array, Float
 from jaxface.models.morphable import MorphableModel
 from jaxface.stages.fit import FitConfig, FitInput, FitModel, FitWeights, prepare
-from jaxface.stages.fit.solve import _fit_landmarks
+from jaxface.stages.fit.solve import fit_landmarks
 
 
 def _landmarks_to_shape(
@@ -26,7 +26,7 @@ def _landmarks_to_shape(
         log_focal_deviation=jnp.asarray(0.3, points.dtype),
         estimate_inliers=jnp.asarray(False),
     )
-    y, _ = _fit_landmarks(data, model, weights, config)
+    y, _ = fit_landmarks(data, model, weights, config)
     vertices = model.model.shape(y.identity, y.expression)
     screen = y.camera(data.principal).project(y.pose(model.points(vertices)))
     return vertices, screen[:, :2]

@@ -14,11 +14,13 @@ def test_finds_the_bundled_landmarks_again():
     bare = eqx.tree_at(lambda m: (m.landmarks68, m.landmarks468), model, (None, None))
     found = embed_landmarks(bare, yaws=(-15.0, 0.0, 15.0))
     assert found.views == 3
+    assert model.landmarks468 is not None and model.landmarks68 is not None
     distance = np.linalg.norm(
         np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1
     )
     assert np.median(distance) < 3.0
     complete = with_landmarks(bare, found.points)
+    assert complete.landmarks68 is not None
     inner = np.asarray(complete.landmarks68(model.mean) - model.landmarks68(model.mean))[17:]
     assert np.median(np.linalg.norm(inner, axis=1)) < 3.0
 

@@ -18,18 +18,21 @@ from jaxface.io.image import Photo, read_image
 from jaxface.io.models import load_model
 from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel
-from jaxface.models.parameters import FaceParameters
+from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.models.subdivide import subdivide
 from jaxface.pipeline.clock import Clock, quick_compilation
 from jaxface.stages.fit import (
     FitConfig,
+    FitInput,
     FitModel,
     FitRender,
     FitStats,
     FitWeights,
     Posterior,
     WorkingPhoto,
-    fit_parameters,
+    fit_level,
+    fit_start,
+    join_records,
     posterior,
     prepare,
     render_fit,
@@ -118,8 +121,34 @@ class FittedFace:
 
 
 @functools.cache
-def _fit_program() -> Any:
-    return jax.jit(fit_parameters, compiler_options=quick_compilation())
+def _start_program() -> Any:
+    return jax.jit(fit_start, compiler_options=quick_compilation())
+
+
+@functools.cache
+def _level_program(level: int) -> Any:
+    return jax.jit(functools.partial(fit_level, level=level), compiler_options=quick_compilation())
+
+
+def _fit_levels(
+    clock: Clock,
+    data: FitInput,
+    models: tuple[FitModel, ...],
+    weights: FitWeights,
+    config: FitConfig,
+) -> tuple[FaceParameters, FitStats]:
+    """``fit_parameters``, a program a level, so that they compile side by side."""
+    programs = [_level_program(level) for level in range(len(models))]
+    y = jax.eval_shape(neutral_parameters, models[0].model)
+    calls = [(_start_program(), (data, models[0], weights, config))]
+    calls += [(p, (y, data, m, weights, config)) for p, m in zip(programs, models, strict=True)]
+    clock.prepare("fit", calls)
+    y, record = clock.run("fit", _start_program(), data, models[0], weights, config)
+    records = [record]
+    for program, model in zip(programs, models, strict=True):
+        y, record = clock.run("fit", program, y, data, model, weights, config)
+        records.append(record)
+    return y, join_records(records)
 
 
 @functools.cache
@@ -277,7 +306,7 @@ def fit(
     )
     weights = weights or FitWeights()
     config = FitConfig(steps=tuple(steps), extra_terms=tuple(extra_terms))
-    parameters, stats = clock.run("fit", _fit_program(), working.data, models, weights, config)
+    parameters, stats = _fit_levels(clock, working.data, models, weights, config)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
     spread = clock.run(

@@ -219,7 +219,7 @@ def report(fitted: FittedFace, folder: Path, title: str) -> Mapping[str, Any]:
                 "value": float(np.median(spread[face])),
                 "unit": "mm",
             },
-            {"label": "photo term", "value": energies[-1]["terms"]["photo"][-1], "unit": ""},
+            {"label": "colour difference on the skin", "value": _misfit(fitted), "unit": ""},
         ],
         "images": [
             {"title": name, "file": name}
@@ -250,6 +250,14 @@ def report(fitted: FittedFace, folder: Path, title: str) -> Mapping[str, Any]:
         "licences": _licences(model),
         "files": present,
     }
+
+
+def _misfit(fitted: FittedFace) -> float:
+    """``E_c`` on the pixels that show skin: mean distance in linear RGB, the face's median 0.5."""
+    difference = np.asarray(fitted.render().color - fitted.working.data.image)
+    weight = fitted.skin_map()
+    total = np.sum(weight * np.linalg.norm(difference, axis=-1))
+    return float(total / max(weight.sum(), 1.0))
 
 
 def _licences(model: MorphableModel) -> list[dict[str, str]]:

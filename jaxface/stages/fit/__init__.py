@@ -4,16 +4,16 @@ from jaxface.stages.fit.batch import fit_batch
 from jaxface.stages.fit.photo import WorkingPhoto, working_photo
 from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
-from jaxface.stages.fit.rendering import FitRender, render_fit, skin_map
-from jaxface.stages.fit.solve import (
+from jaxface.stages.fit.records import (
     FitConfig,
     FitData,
     FitInput,
     FitStats,
     FitWeights,
-    fit_energy,
-    fit_parameters,
+    join_records,
 )
+from jaxface.stages.fit.rendering import FitRender, render_fit, skin_map
+from jaxface.stages.fit.solve import fit_energy, fit_level, fit_parameters, fit_start
 
 __all__ = [
     "FitConfig",
@@ -27,7 +27,10 @@ __all__ = [
     "WorkingPhoto",
     "fit_batch",
     "fit_energy",
+    "fit_level",
     "fit_parameters",
+    "fit_start",
+    "join_records",
     "posterior",
     "prepare",
     "render_fit",

@@ -9,7 +9,7 @@ from jaxface._types import Float
 from jaxface.imaging.crop import Crop, crop_face
 from jaxface.imaging.masks import face_oval_mask
 from jaxface.models.landmark_schemes import CONTOURS, INNER_68, MEDIAPIPE_TO_IBUG68
-from jaxface.stages.fit.solve import FitInput
+from jaxface.stages.fit.records import FitInput
 
 OUTER_EYE_CORNERS = {68: (36, 45), 468: (33, 263)}
 DEFAULT_FOCAL = 1.4

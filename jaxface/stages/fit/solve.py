@@ -21,7 +21,6 @@ from jaxface.energies.landmark import (
 )
 from jaxface.energies.photometric import (
     PhotometricData,
-    PixelSamples,
     photometric_energy,
     sample_pixels,
     synthesize,
@@ -39,86 +38,18 @@ from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import sh_basis
 from jaxface.solvers.gauss_newton import Problem, gauss_newton
+from jaxface.solvers.solution import Solution
 from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.prepared import FitModel
-
-
-class FitWeights(eqx.Module):
-    """Weights of the terms; the first three as in Saito 2017."""
-
-    photo: float | Array = 1.0
-    landmark: float | Array = 10.0
-    prior: float | Array = 2.5e-5
-    noise: float | Array = 0.03
-    """``E_c`` (linear RGB, face at median 0.5) at which the photo term has its own weight: it
-    counts ``noise / E_c``, the more the better the model explains the photo; 0 gives the paper's
-    constant weight"""
-    landmark_scale: float | Array = 0.025
-    """distance (of the eye distance) at which a landmark counts half, as an outlier does; 0
-    gives the paper's plain squares"""
-    focal: float | Array = 2.5e-5
-    """of the prior on the focal length (not in the paper)"""
-    light: float | Array = 2.5e-5
-    """of the damping of the light's upper bands (not in the paper)"""
-
-
-class FitConfig(eqx.Module):
-    """Settings of a fit that are fixed at compile time."""
-
-    steps: tuple[int, ...] = eqx.field(static=True, default=(30, 10, 3))
-    """Gauss-Newton steps on each pyramid level, coarsest first"""
-    landmark_steps: int = eqx.field(static=True, default=15)
-    """steps on landmarks and prior alone, before the first level"""
-    curvature_pixels: int = eqx.field(static=True, default=6000)
-    """pixels (evenly spread) on which the Jacobian is formed; the gradient uses all"""
-    rtol: float = eqx.field(static=True, default=1e-5)
-    extra_terms: tuple[Term, ...] = eqx.field(static=True, default=())
-    """your own terms, functions of ``(FaceParameters, FitData)``"""
-
-
-class FitInput(eqx.Module):
-    """One photo, cut to the working image, and what was detected on it."""
-
-    image: Float[Array, "s s 3"]
-    """linear RGB"""
-    mask: Float[Array, "s s"]
-    """valid face pixels, 0 to 1"""
-    landmarks: Float[Array, "l 2"]
-    """(x, y) as fractions of the side"""
-    landmark_weight: Float[Array, "l"]
-    landmark_unit: Float[Array, ""]
-    """outer eye corners' distance, as a fraction of the side"""
-    principal: Float[Array, "2"]
-    """principal point, as fractions of the side"""
-    log_focal: Float[Array, ""]
-    """prior mean of the logarithm of the focal length over the side"""
-    log_focal_deviation: Float[Array, ""]
-    estimate_inliers: Array
-    """True: hair, hands and glasses are looked for in the mask; False: the mask is trusted"""
-
-
-class FitData(eqx.Module):
-    """What one Gauss-Newton step holds fixed: visible pixels, landmarks, priors."""
-
-    photo: PhotometricData
-    photo_trust: Float[Array, ""]
-    """``noise / E_c``: a Laplacian of unknown width has ``log E_c`` for its likelihood"""
-    curvature_samples: PixelSamples
-    landmark: LandmarkData
-    normal_modes: Float[Array, "n 3 k"]
-    """derivative of the vertex normals along the shape modes, from the start of the level"""
-    focal_prior: tuple[Array, Array]
-
-
-class FitStats(eqx.Module):
-    """History of a fit, one entry a level (the first is the landmark-only start)."""
-
-    energies: tuple[dict[str, Array], ...]
-    """per level: (steps + 1,) energy of every term before each step and after the last"""
-    steps: tuple[Array, ...]
-    """steps used on each level"""
-    curvature: Float[Array, "p p"]
-    """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
+from jaxface.stages.fit.records import (
+    FitConfig,
+    FitData,
+    FitInput,
+    FitStats,
+    FitWeights,
+    LevelRecord,
+    join_records,
+)
 
 
 def fit_energy(weights: FitWeights, extra_terms: Sequence[Term] = ()) -> Energy:
@@ -167,27 +98,53 @@ def fit_parameters(
     Returns:
         The parameters and the history.
     """
-    y, landmark_history = _fit_landmarks(data, models[0], weights, config)
+    y, first = fit_start(data, models[0], weights, config)
+    records = [first]
+    for level, model in enumerate(models):
+        y, record = fit_level(y, data, model, weights, config, level)
+        records.append(record)
+    return y, join_records(records)
+
+
+def fit_start(
+    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
+) -> tuple[FaceParameters, LevelRecord]:
+    """Before the first level: pose and coefficients from the landmarks, light in closed form."""
+    y, record = fit_landmarks(data, model, weights, config)
+    image, mask = _level_image(data, len(config.steps), 0)
+    return initial_light(y, image, mask, data, model), record
+
+
+def fit_level(
+    y: FaceParameters,
+    data: FitInput,
+    model: FitModel,
+    weights: FitWeights,
+    config: FitConfig,
+    level: int,
+) -> tuple[FaceParameters, LevelRecord]:
+    """One pyramid level (0 is the coarsest) from the parameters of the last."""
     energy = fit_energy(weights, config.extra_terms)
-    levels = len(config.steps)
-    images = pyramid(data.image, levels)[::-1]
-    masks = [m[..., 0] for m in pyramid(data.mask[..., None], levels)[::-1]]
-    y = initial_light(y, images[0], masks[0], data, models[0])
-    histories, used = [landmark_history[0]], [landmark_history[1]]
-    for image, mask, model, steps in zip(images, masks, models, config.steps, strict=True):
-        problem = Problem(
-            energy=energy.value,
-            quadratic=energy.quadratic,
-            refresh=lambda y, args: observe(y, *args, curvature_pixels=config.curvature_pixels),
-        )
-        modes = normal_modes(y, model.model, model.stencil)
-        args = (image, mask, data, model, modes, weights)
-        solution = gauss_newton(problem, y, args, steps=steps, rtol=config.rtol)
-        y = solution.value
-        histories.append(solution.stats["history"])
-        used.append(solution.stats["num_steps"])
-        curvature = solution.stats["curvature"]
-    return y, FitStats(tuple(histories), tuple(used), curvature)
+    problem = Problem(
+        energy=energy.value,
+        quadratic=energy.quadratic,
+        refresh=lambda y, args: observe(y, *args, curvature_pixels=config.curvature_pixels),
+    )
+    image, mask = _level_image(data, len(config.steps), level)
+    args = (image, mask, data, model, normal_modes(y, model.model, model.stencil), weights)
+    solution = gauss_newton(problem, y, args, steps=config.steps[level], rtol=config.rtol)
+    return solution.value, _record(solution)
+
+
+def _record(solution: Solution) -> LevelRecord:
+    stats = solution.stats
+    return LevelRecord(stats["history"], stats["num_steps"], stats["curvature"])
+
+
+def _level_image(data: FitInput, levels: int, level: int) -> tuple[Array, Array]:
+    both = jnp.concatenate([data.image, data.mask[..., None]], axis=-1)
+    shrunk = pyramid(both, levels)[levels - 1 - level]
+    return shrunk[..., :3], shrunk[..., 3]
 
 
 def observe(
@@ -257,7 +214,9 @@ def landmark_data(data: FitInput, model: FitModel) -> LandmarkData:
     )
 
 
-def _fit_landmarks(data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig):
+def fit_landmarks(
+    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
+) -> tuple[FaceParameters, LevelRecord]:
     """Closed-form pose, then pose, camera and coefficients from landmarks and prior alone."""
     y = neutral_parameters(model.model)
     y = eqx.tree_at(lambda p: p.log_focal, y, data.log_focal)
@@ -284,7 +243,7 @@ def _fit_landmarks(data: FitInput, model: FitModel, weights: FitWeights, config:
     solution = gauss_newton(
         problem, y, (data, model), steps=config.landmark_steps, rtol=config.rtol
     )
-    return solution.value, (solution.stats["history"], solution.stats["num_steps"])
+    return solution.value, _record(solution)
 
 
 class _GeometricData(eqx.Module):

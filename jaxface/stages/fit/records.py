@@ -1,0 +1,105 @@
+"""What goes into a fit, what one step holds fixed, and what comes out."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+
+from jaxface._types import Array, Float
+from jaxface.energies.landmark import LandmarkData
+from jaxface.energies.photometric import PhotometricData, PixelSamples
+from jaxface.energies.term import Term
+
+
+class FitWeights(eqx.Module):
+    """Weights of the terms; the first three as in Saito 2017."""
+
+    photo: float | Array = 1.0
+    landmark: float | Array = 10.0
+    prior: float | Array = 2.5e-5
+    noise: float | Array = 0.03
+    """``E_c`` (linear RGB, face at median 0.5) at which the photo term has its own weight: it
+    counts ``noise / E_c``, the more the better the model explains the photo; 0 gives the paper's
+    constant weight"""
+    landmark_scale: float | Array = 0.025
+    """distance (of the eye distance) at which a landmark counts half, as an outlier does; 0
+    gives the paper's plain squares"""
+    focal: float | Array = 2.5e-5
+    """of the prior on the focal length (not in the paper)"""
+    light: float | Array = 2.5e-5
+    """of the damping of the light's upper bands (not in the paper)"""
+
+
+class FitConfig(eqx.Module):
+    """Settings of a fit that are fixed at compile time."""
+
+    steps: tuple[int, ...] = eqx.field(static=True, default=(30, 10, 3))
+    """Gauss-Newton steps on each pyramid level, coarsest first"""
+    landmark_steps: int = eqx.field(static=True, default=15)
+    """steps on landmarks and prior alone, before the first level"""
+    curvature_pixels: int = eqx.field(static=True, default=6000)
+    """pixels (evenly spread) on which the Jacobian is formed; the gradient uses all"""
+    rtol: float = eqx.field(static=True, default=1e-5)
+    extra_terms: tuple[Term, ...] = eqx.field(static=True, default=())
+    """your own terms, functions of ``(FaceParameters, FitData)``"""
+
+
+class FitInput(eqx.Module):
+    """One photo, cut to the working image, and what was detected on it."""
+
+    image: Float[Array, "s s 3"]
+    """linear RGB"""
+    mask: Float[Array, "s s"]
+    """valid face pixels, 0 to 1"""
+    landmarks: Float[Array, "l 2"]
+    """(x, y) as fractions of the side"""
+    landmark_weight: Float[Array, "l"]
+    landmark_unit: Float[Array, ""]
+    """outer eye corners' distance, as a fraction of the side"""
+    principal: Float[Array, "2"]
+    """principal point, as fractions of the side"""
+    log_focal: Float[Array, ""]
+    """prior mean of the logarithm of the focal length over the side"""
+    log_focal_deviation: Float[Array, ""]
+    estimate_inliers: Array
+    """True: hair, hands and glasses are looked for in the mask; False: the mask is trusted"""
+
+
+class FitData(eqx.Module):
+    """What one Gauss-Newton step holds fixed: visible pixels, landmarks, priors."""
+
+    photo: PhotometricData
+    photo_trust: Float[Array, ""]
+    """``noise / E_c``: a Laplacian of unknown width has ``log E_c`` for its likelihood"""
+    curvature_samples: PixelSamples
+    landmark: LandmarkData
+    normal_modes: Float[Array, "n 3 k"]
+    """derivative of the vertex normals along the shape modes, from the start of the level"""
+    focal_prior: tuple[Array, Array]
+
+
+class FitStats(eqx.Module):
+    """History of a fit, one entry a level (the first is the landmark-only start)."""
+
+    energies: tuple[dict[str, Array], ...]
+    """per level: (steps + 1,) energy of every term before each step and after the last"""
+    steps: tuple[Array, ...]
+    """steps used on each level"""
+    curvature: Float[Array, "p p"]
+    """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
+
+
+class LevelRecord(eqx.Module):
+    """What one level leaves behind besides the parameters."""
+
+    energies: dict[str, Array]
+    steps: Array
+    curvature: Float[Array, "p p"]
+
+
+def join_records(records: Sequence[LevelRecord]) -> FitStats:
+    """The history of a fit from those of its levels, the landmark-only start first."""
+    return FitStats(
+        tuple(r.energies for r in records),
+        tuple(r.steps for r in records),
+        records[-1].curvature,
+    )
