@@ -10,6 +10,7 @@ distance between the outer eye corners (inner 51 points).
     python benchmarks/fit_accuracy.py /tmp/faces
 """
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Annotated
@@ -28,6 +29,7 @@ from jaxface.io.models import load_model
 from jaxface.io.overlay import contact_sheet
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
+from jaxface.pipeline.embedding import embed_landmarks
 from jaxface.render.shading import irradiance
 
 COLUMNS = (
@@ -106,6 +108,7 @@ def main(
         "makehuman"
     ),
     details: Annotated[str, typer.Option(help="subdivision on each level, e.g. 0,1,2")] = "",
+    embed: Annotated[bool, typer.Option(help="find 468 points on a model without them")] = True,
     only: Annotated[str, typer.Option(help="of the photos, those whose name has this")] = "",
     output: Annotated[Path, typer.Option(help="folder of the results")] = RESULTS,
     sheet: Annotated[Path | None, typer.Option(help="contact sheet (PNG) to write")] = None,
@@ -119,6 +122,9 @@ def main(
     finest = tuple(int(level) for level in details.split(",")) if details else None
     truth_model = subdivide(source, matching_level(source, len(load_truth(stems[0])["albedo"])))
     digest = model_digest(truth_model)
+    embedded = embed and source.landmarks468 is None
+    if embedded:
+        source = dataclasses.replace(source, landmarks468=embed_landmarks(source).points)
     region = face_region(truth_model)
     rows, panels = [], []
     for stem in stems:
@@ -144,6 +150,7 @@ def main(
     report = {
         "model": source.name,
         "details": details or "default",
+        "landmarks": "468, embedded" if embedded else "as the model has them",
         "region_vertices": len(region),
         "provenance": origin,
         "photos": rows,
