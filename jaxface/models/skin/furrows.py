@@ -1,55 +1,60 @@
 """The network of fine furrows that divides skin into cells of half a millimetre."""
 
+import jax
 import jax.numpy as jnp
 
-from jaxface._types import Array, Float, Int
+from jaxface._types import Array, Int
 from jaxface.models.skin.attributes import SkinAttributes
-from jaxface.models.skin.noise import cell_hash, layer_seed, uniforms, visible
+from jaxface.models.skin.noise import cell_hash, lattice, layer_seed, uniforms, visible
 from jaxface.models.skin.patch import SkinPatch
+from jaxface.models.skin.pigments import Density
+from jaxface.models.skin.rows import Row, dot
 
-# Size of the cells (mm) of the coarse and of the fine network.
-CELLS = (1.05, 0.55)
-STRENGTHS = (0.075, 0.06)
-STRETCH = 0.45
-"""share by which cells are longer along the lines of tension"""
+CELLS = (1.25, 0.7)
+"""size of the cells (mm) of the coarse and of the fine network"""
+STRENGTHS = (0.07, 0.07)
+STRETCH = 0.5
+"""share by which squared distances along the lines of tension count less"""
+EDGE = 0.3
+"""half the width of a furrow, in cells"""
 
 
-def furrows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Float[Array, "3 n"]:
-    """Density of the furrows (rows of `pigments.PIGMENTS`), with mean about zero.
+def furrows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
+    """Density of the furrows and of the paler cells between them, with mean about zero.
 
     Edges of a Voronoi diagram (Worley, "A cellular texture basis function", SIGGRAPH 1996) whose
-    metric follows the lines of tension.
+    metric follows the lines of tension. Each cell has a tone of its own.
     """
     r = patch.regions
-    amount = r.skin * (1 - 0.6 * r.nose) * (1 - r.lips) * (0.75 + 0.35 * r.forehead + 0.5 * r.lid)
+    amount = r.skin * (1 - 0.6 * r.nose) * (1 - r.lips) * (0.8 + 0.3 * r.forehead + 0.5 * r.lid)
     depth = jnp.zeros_like(r.skin)
     for layer, (cell, strength) in enumerate(zip(CELLS, STRENGTHS, strict=True)):
-        near, next_near = _two_nearest(patch, cell, layer_seed(seed, 20 + layer))
-        edge = jnp.clip(1.0 - (next_near - near) / 0.32, 0.0, 1.0)
-        shown = visible(cell * 1.2, patch.texel)
-        depth = depth + strength * shown * (edge * edge - 0.15)
+        near, next_near, tone = _two_nearest(patch, cell, layer_seed(seed, 20 + layer))
+        edge = jnp.clip(1.0 - (next_near - near) / EDGE, 0.0, 1.0)
+        shown = visible(cell * 1.3, patch.texel)
+        depth = depth + strength * shown * (edge * edge - 0.14 + 0.35 * (tone - 0.5))
     depth = depth * amount * traits.furrows
-    return jnp.stack([0.3 * depth, 0.35 * depth, 0.35 * depth])
+    return Density(0.3 * depth, 0.45 * depth, 0.25 * depth)
 
 
-def _two_nearest(
-    patch: SkinPatch, cell: float, seed: Int[Array, ""]
-) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Distance to the nearest and the second nearest of one random point per cell (cells)."""
-    scaled = patch.position * (1.0 / cell)
-    corner = jnp.floor(scaled)
-    part = scaled - corner
-    base = corner.astype(jnp.int32)
-    first = jnp.full_like(part[0], 9.0)
-    second = first
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
-            for k in (-1, 0, 1):
-                step = (i, j, k)
-                place = uniforms(cell_hash([base[a] + step[a] for a in range(3)], seed))
-                delta = [part[a] - step[a] - place[a] for a in range(3)]
-                along = sum(d * t for d, t in zip(delta, patch.tension, strict=True))
-                squared = sum(d * d for d in delta) - STRETCH * along * along
-                second = jnp.minimum(second, jnp.maximum(first, squared))
-                first = jnp.minimum(first, squared)
-    return jnp.sqrt(jnp.maximum(first, 0.0)), jnp.sqrt(jnp.maximum(second, 0.0))
+def _two_nearest(patch: SkinPatch, cell: float, seed: Int[Array, ""]) -> tuple[Row, Row, Row]:
+    """Distances (cells) to the nearest two of one random point per cell, and the first's number."""
+    scaled = [p * (1.0 / cell) for p in patch.position]
+    corner = [jnp.floor(s) for s in scaled]
+    part = [s - c for s, c in zip(scaled, corner, strict=True)]
+    base = lattice((corner[0], corner[1], corner[2]))
+
+    def add(index: Array, found: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+        first, second, tone = found
+        step = (index % 3 - 1, index // 3 % 3 - 1, index // 9 - 1)
+        place = uniforms(cell_hash(base, step, seed))
+        x, y, z = (t - s - q for t, s, q in zip(part, step, place, strict=True))
+        along = dot((x, y, z), patch.tension)
+        squared = x * x + y * y + z * z - STRETCH * along * along
+        second = jnp.minimum(second, jnp.maximum(first, squared))
+        tone = jnp.where(squared < first, place[0], tone)
+        return jnp.minimum(first, squared), second, tone
+
+    far = jnp.full_like(part[0], 9.0)
+    first, second, tone = jax.lax.fori_loop(0, 27, add, (far, far, jnp.zeros_like(far)))
+    return jnp.sqrt(jnp.maximum(first, 0.0)), jnp.sqrt(jnp.maximum(second, 0.0)), tone

@@ -1,80 +1,67 @@
 """Marks of pigment and blood: freckles, moles, age spots, blemishes."""
 
-import jax
 import jax.numpy as jnp
 
-from jaxface._types import Array, Float, Int
+from jaxface._types import Array, Int
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed
 from jaxface.models.skin.patch import SkinPatch
-from jaxface.models.skin.spots import Spot, gather_spots
+from jaxface.models.skin.pigments import Density
+from jaxface.models.skin.rows import Row, smoothstep
+from jaxface.models.skin.spots import Spot, gather_spots, likely
 
 
-def freckles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Float[Array, "3 n"]:
+def freckles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of freckles: small irregular spots of melanin where the sun reaches."""
     r = patch.regions
     sun = r.skin * (1 - r.lips) * (1 - r.scalp) * (1 - 0.8 * r.lid) * (1 - r.neck)
-    sun = sun * jnp.clip(0.25 + r.cheek + r.nose + 0.45 * r.forehead, 0, 1.2) * (1 - 0.5 * r.chin)
-    ragged = 0.45 * gradient_noise(patch.position, 1.1, layer_seed(seed, 30))
-    cluster = gradient_noise(patch.position, 14.0, layer_seed(seed, 31))
-    density = jnp.zeros_like(r.skin)
-    for layer, (cell, size, strength) in enumerate(((2.0, 0.55, 0.38), (3.6, 1.05, 0.30))):
-        share = traits.freckles * (0.75 + 0.25 * cluster) * sun
+    sun = sun * jnp.clip(0.25 + r.cheek + r.nose + 0.45 * r.forehead, 0.0, 1.2) * (1 - 0.5 * r.chin)
+    ragged = 0.16 * gradient_noise(patch.position, 1.0, layer_seed(seed, 30))
+    cluster = gradient_noise(patch.position, 16.0, layer_seed(seed, 31))
+    chance = traits.freckles * (0.75 + 0.3 * cluster) * sun
 
-        def shade(spot: Spot, share=share, size=size) -> Array:
+    def spots(cell: float, size: float, layer: int) -> Row:
+        def shade(spot: Spot) -> Row:
             u, v, w = spot.random
-            radius = size * (0.35 + 0.65 * v * v)
-            reach = jnp.sqrt(spot.distance2) / radius * (1.0 + 0.35 * ragged)
-            present = jax.nn.sigmoid((share - u) * 14.0)
-            return present * spot.on_surface * (0.3 + 0.7 * w) * _rim(reach, 0.55)
+            reach = jnp.sqrt(spot.distance2) / (size * (0.35 + 0.65 * v * v)) + ragged
+            return likely(chance, u, 14.0) * spot.on_surface * (0.3 + 0.7 * w) * _rim(reach, 0.65)
 
-        spots = gather_spots(
-            patch.position, patch.normal, cell, layer_seed(seed, 32 + layer), shade
-        )
-        density = density + strength * spots
+        return gather_spots(patch.position, patch.normal, cell, layer_seed(seed, layer), shade)
+
+    density = 0.34 * spots(2.0, 0.6, 32) + 0.26 * spots(3.6, 1.15, 33)
     density = density * jnp.sqrt(traits.freckles)
-    return jnp.stack([density, 0.1 * density, jnp.zeros_like(density)])
+    return Density(density, 0.1 * density)
 
 
-def moles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Float[Array, "3 n"]:
+def marks(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of moles (few, dark), age spots (broad, faint) and blemishes (red)."""
     r = patch.regions
     bare = r.skin * (1 - r.lips) * (1 - r.scalp)
-    ragged = 0.3 * gradient_noise(patch.position, 2.2, layer_seed(seed, 40))
+    ragged = 0.12 * gradient_noise(patch.position, 2.0, layer_seed(seed, 40))
 
-    def scattered(layer: int, cell: float, amount: Array, size: tuple[float, float], soft: float):
-        def shade(spot: Spot) -> Array:
+    def spots(
+        layer: int, cell: float, chance: Row | Array, size: tuple[float, float], soft: float
+    ) -> Row:
+        def shade(spot: Spot) -> Row:
             u, v, w = spot.random
-            radius = size[0] + (size[1] - size[0]) * v * v
-            reach = jnp.sqrt(spot.distance2) / radius * (1.0 + 0.35 * ragged)
-            return (
-                (u < amount)
-                * jnp.minimum(3 * spot.on_surface, 1.0)
-                * (0.4 + 0.6 * w)
-                * _rim(reach, soft)
-            )
+            radius = size[0] + (size[1] - size[0]) * v * v * v
+            reach = jnp.sqrt(spot.distance2) / radius + ragged
+            present = (u < chance) * jnp.minimum(4.0 * spot.on_surface, 1.0)
+            return present * (0.35 + 0.65 * w) * _rim(reach, soft)
 
-        return bare * gather_spots(
-            patch.position, patch.normal, cell, layer_seed(seed, 41 + layer), shade
-        )
+        seed_of = layer_seed(seed, 41 + layer)
+        return bare * gather_spots(patch.position, patch.normal, cell, seed_of, shade)
 
-    mole = scattered(0, 13.0, 0.01 + 0.10 * traits.moles, (0.35, 1.5), 0.35)
-    tiny = scattered(1, 7.0, 0.02 + 0.10 * traits.moles, (0.2, 0.45), 0.5)
-    brown = scattered(
-        2, 9.0, 0.35 * traits.age_spots * (0.4 + r.forehead + r.cheek), (0.9, 4.0), 0.5
-    )
-    red = scattered(
-        3,
-        8.0,
-        0.14 * traits.blemishes * (0.4 + r.chin + r.cheek + 0.6 * r.forehead),
-        (0.5, 2.2),
-        0.9,
-    )
-    melanin = 0.9 * mole + 0.7 * tiny + 0.28 * brown
-    return jnp.stack([melanin, 0.45 * red + 0.2 * mole, 0.15 * mole])
+    mole = spots(0, 17.0, 0.01 + 0.09 * traits.moles, (0.4, 1.7), 0.45)
+    tiny = spots(1, 9.0, 0.02 + 0.10 * traits.moles, (0.25, 0.5), 0.6)
+    where = 0.4 + r.forehead + r.cheek
+    brown = spots(2, 9.0, 0.35 * traits.age_spots * where, (0.9, 4.2), 0.5)
+    where = 0.3 + r.chin + 0.8 * r.cheek + 0.6 * r.forehead
+    red = spots(3, 9.0, 0.12 * traits.blemishes * where, (0.5, 2.4), 0.95)
+    melanin = 0.85 * mole + 0.45 * tiny + 0.22 * brown
+    return Density(melanin, 0.3 * red + 0.25 * mole + 0.1 * tiny, 0.15 * mole)
 
 
-def _rim(reach: Float[Array, "n"], soft: float) -> Float[Array, "n"]:
+def _rim(reach: Row, soft: float) -> Row:
     """1 inside a spot of radius 1, falling to 0 over the last ``soft`` part of it."""
-    t = jnp.clip((1.0 - reach) / soft, 0.0, 1.0)
-    return t * t * (3 - 2 * t)
+    return smoothstep(1.0 - reach, 0.0, soft)

@@ -6,19 +6,22 @@ import jax.numpy as jnp
 
 from jaxface._types import Array, Float, Int
 from jaxface.models.skin.regions import Regions, SkinFields
+from jaxface.models.skin.rows import Row, Vector, unit
 
 
 class SkinPatch(eqx.Module):
-    """Points of the surface, one a texel; vectors are three rows."""
+    """Points of the surface, one a texel."""
 
-    position: Float[Array, "3 n"]
+    position: Vector
     """mm, on the model's mean face"""
-    normal: Float[Array, "3 n"]
-    tension: Float[Array, "3 n"]
-    hair: Float[Array, "3 n"]
+    normal: Vector
+    tension: Vector
+    hair: Vector
     regions: Regions
-    texel: Float[Array, "n"]
+    texel: Row
     """size of a texel (mm)"""
+    landmarks: Float[Array, "68 3"]
+    """mm"""
 
 
 def patch_at(
@@ -28,7 +31,7 @@ def patch_at(
     triangle: Int[Array, "n"],
     barycentric: Float[Array, "n 2"],
     resolution: int,
-) -> tuple[SkinPatch, Float[Array, "3 n"]]:
+) -> tuple[SkinPatch, Vector]:
     """Interpolate the fields, and a base albedo, at texels of a UV layout.
 
     Args:
@@ -46,17 +49,19 @@ def patch_at(
     corners = faces[triangle]
     b, c = barycentric[:, 0:1], barycentric[:, 1:2]
     rows = table[corners[:, 0]] * (1 - b - c) + table[corners[:, 1]] * b + table[corners[:, 2]] * c
+    # Once in memory, row by row; else every layer would gather again.
     values = jax.lax.optimization_barrier(rows.T)
+
+    def vector(start: int) -> Vector:
+        return values[start], values[start + 1], values[start + 2]
+
     patch = SkinPatch(
-        position=values[0:3],
-        normal=_unit(values[3:6]),
-        tension=_unit(values[6:9]),
-        hair=_unit(values[9:12]),
+        position=vector(0),
+        normal=unit(vector(3)),
+        tension=unit(vector(6)),
+        hair=unit(vector(9)),
         regions=Regions(**{name: values[16 + i] for i, name in enumerate(names)}),
         texel=values[15] / resolution,
+        landmarks=fields.landmarks,
     )
-    return patch, values[12:15]
-
-
-def _unit(vector: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    return vector * jax.lax.rsqrt(jnp.maximum(jnp.sum(vector * vector, axis=0), 1e-12))
+    return jax.lax.optimization_barrier(patch), vector(12)

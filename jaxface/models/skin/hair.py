@@ -1,0 +1,124 @@
+"""Hair as short strokes: beard stubble, brows, the roots on the scalp, pale down on the cheeks."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxface._types import Array, Int
+from jaxface.models.skin.attributes import SkinAttributes
+from jaxface.models.skin.noise import gradient_noise, layer_seed, mix
+from jaxface.models.skin.patch import SkinPatch
+from jaxface.models.skin.pigments import Density
+from jaxface.models.skin.rows import Row, Vector, cross
+from jaxface.models.skin.spots import Spot, gather_spots, likely, stroke
+
+STUBBLE_CELL, SCALP_CELL, BROW_CELL, DOWN_CELL = 1.0, 1.1, 5.0, 1.3
+"""mm; a stroke is at most as long"""
+HALF_WIDTH = 0.09
+"""mm, of a thick hair"""
+
+
+def _strokes(
+    patch: SkinPatch,
+    direction: Vector,
+    cell: float,
+    chance: Row,
+    lean: Row,
+    spread: float,
+    length: tuple[float | Array, float | Array],
+    width: float,
+    seed: Int[Array, ""],
+    layers: int = 1,
+) -> Row:
+    """Cover of hairs, ``layers`` of them per ``cell^2`` mm^2 where the chance is 1.
+
+    Args:
+        patch: texels.
+        direction: of growth.
+        cell: mm.
+        chance: that a hair is present.
+        lean: tangent of the angle to the direction, common to all.
+        spread: range of the tangents of single hairs.
+        length: half of the shortest and of the longest (mm); at most half a cell.
+        width: half of it (mm).
+        seed: of this kind of hair.
+        layers: independent sets of hairs laid over each other.
+    """
+    chance, lean = jax.lax.optimization_barrier((chance, lean))
+    across = jax.lax.optimization_barrier(cross(patch.normal, direction))
+
+    def shade(spot: Spot) -> Row:
+        u, v, w = spot.random
+        half = length[0] + (length[1] - length[0]) * v
+        line = stroke(
+            spot.offset, direction, across, lean + (w - 0.5) * spread, half, width, patch.texel
+        )
+        near = jnp.minimum(3.0 * spot.on_surface, 1.0)
+        return likely(chance, u, 10.0) * near * line * (0.45 + 0.55 * v)
+
+    def add(layer: Array, cover: Row) -> Row:
+        seed_of = mix(seed + jnp.uint32(0x9E3779B9) * (layer.astype(jnp.uint32) + 1))
+        return cover + gather_spots(patch.position, patch.normal, cell, seed_of, shade)
+
+    return jax.lax.fori_loop(0, layers, add, jnp.zeros_like(chance))
+
+
+def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
+    """Density of the beard: strokes, and the blue-grey of the roots under the skin."""
+    patchy = gradient_noise(patch.position, 12.0, layer_seed(seed, 50))
+    lean = 0.35 * gradient_noise(patch.position, 12.0, layer_seed(seed, 51))
+    where = jnp.clip(patch.regions.beard * (1.15 + 0.2 * patchy) - 0.12, 0.0, 1.0)
+    grown = 0.25 + 0.75 * traits.stubble
+    hairs = _strokes(
+        patch, patch.hair, STUBBLE_CELL, where * (0.35 + 0.65 * traits.stubble), lean, 1.0,
+        (0.12, 0.12 + 0.36 * grown), HALF_WIDTH, layer_seed(seed, 52), layers=3,
+    )  # fmt: skip
+    dark = (0.3 + 0.7 * traits.hair_melanin) * where**0.5
+    hairs = 1.1 * (0.35 + 0.65 * traits.stubble) * dark * hairs
+    shadow = 0.17 * traits.stubble * dark * where
+    # Roots seen through the skin look blue: melanin's share is negative to take away yellow.
+    return Density(0.25 * hairs - 0.5 * shadow, -0.15 * shadow, 0.75 * hairs + 1.4 * shadow)
+
+
+def brows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
+    """Density of single hairs over the soft brows of the base albedo."""
+    x, side = patch.position[0], jnp.sign(patch.position[0])
+    # Hairs stand up at the inner end and lie outwards along the brow.
+    outer = jnp.clip(jnp.abs(x) / 45.0, 0.0, 1.0)
+    up = 1.1 - 1.25 * outer
+    direction = (side * (0.35 + outer), up, jnp.zeros_like(x))
+    height = sum(d * n for d, n in zip(direction, patch.normal, strict=True))
+    flat = tuple(d - height * n for d, n in zip(direction, patch.normal, strict=True))
+    inverse = 1.0 / jnp.sqrt(sum(d * d for d in flat) + 1e-6)
+    direction = jax.lax.optimization_barrier(tuple(d * inverse for d in flat))
+    where = jnp.clip(1.5 * patch.regions.brow - 0.25, 0.0, 1.0)
+    hairs = _strokes(
+        patch, direction, BROW_CELL, where, jnp.zeros_like(x), 0.9, (1.2, 2.4), 0.1,
+        layer_seed(seed, 60), layers=14,
+    )  # fmt: skip
+    amount = (0.4 + 0.6 * traits.hair_melanin) * (0.7 + 0.3 * traits.male)
+    return Density(0.25 * amount * hairs, 0.0, 0.65 * amount * hairs)
+
+
+def scalp_roots(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
+    """Density of shorn hair on the scalp."""
+    patchy = gradient_noise(patch.position, 9.0, layer_seed(seed, 80))
+    where = jnp.clip(patch.regions.scalp * (1.1 + 0.1 * patchy) - 0.1, 0.0, 1.0)
+    lean = 0.6 * gradient_noise(patch.position, 25.0, layer_seed(seed, 81))
+    hairs = _strokes(
+        patch, patch.hair, SCALP_CELL, where, lean, 0.8, (0.2, 0.5), HALF_WIDTH,
+        layer_seed(seed, 82), layers=2,
+    )  # fmt: skip
+    hairs = hairs * (0.35 + 0.65 * traits.hair_melanin)
+    return Density(0.25 * hairs, 0.0, 0.6 * hairs)
+
+
+def down(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
+    """Density (negative: paler) of the fine down of cheeks, temples and forehead."""
+    r = patch.regions
+    where = r.skin * (1 - r.lips) * (1 - 0.7 * r.nose) * (1 - r.scalp)
+    lean = 0.7 * gradient_noise(patch.position, 20.0, layer_seed(seed, 90))
+    hairs = _strokes(
+        patch, patch.hair, DOWN_CELL, where, lean, 0.7, (0.3, 0.65), 0.13, layer_seed(seed, 91)
+    )
+    pale = 0.08 * traits.furrows * hairs
+    return Density(-0.5 * pale, -0.5 * pale)
