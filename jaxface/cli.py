@@ -55,6 +55,10 @@ DetailsOption = Annotated[
     str | None,
     typer.Option("--details", help="Subdivisions of the model at each level, as 0,1,2."),
 ]
+ShadowOption = Annotated[
+    bool,
+    typer.Option(help="Shade with what the face hides from itself of the light, or as the paper."),
+]
 ResolutionOption = Annotated[
     int, typer.Option("--resolution", help="Texels along a texture's side.")
 ]
@@ -72,10 +76,12 @@ def digitize(
     weights: WeightsOption = None,
     size: SizeOption = 512,
     details: DetailsOption = None,
+    self_shadow: ShadowOption = True,
     resolution: ResolutionOption = 2048,
 ) -> None:
     """The whole journey: fit a photo, take its albedo, write mesh, maps and report."""
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
+    options["self_shadow"] = self_shadow
     _run(photo, out, with_texture=True, resolution=resolution, **options)
 
 
@@ -91,9 +97,11 @@ def fit(
     weights: WeightsOption = None,
     size: SizeOption = 512,
     details: DetailsOption = None,
+    self_shadow: ShadowOption = True,
 ) -> None:
     """The fit alone: mesh with vertex colours, coefficients, overlay and report."""
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
+    options["self_shadow"] = self_shadow
     _run(photo, out, with_texture=False, **options)
 
 

@@ -1,5 +1,7 @@
 """E_c: value, gradients, the structured Jacobian, reweighting, sampling."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +37,8 @@ modes_of_normals = jax.jit(normal_modes)
 def double_scene():
     with jax.enable_x64(True):
         model = small_model()
+        shadow = np.random.default_rng(5).normal(size=(model.vertex_count, 9))
+        model = dataclasses.replace(model, occlusion=jnp.asarray(0.1 * shadow))
         y = small_parameters(model)
         samples = small_samples(model, y)
         stencil = normal_stencil(np.asarray(model.faces), model.vertex_count)

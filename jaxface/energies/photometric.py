@@ -15,6 +15,7 @@ from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
+from jaxface.render.occlusion import hidden_shading
 from jaxface.render.shading import irradiance
 
 
@@ -109,7 +110,8 @@ def synthesize(
     """``C_synth``: Lambertian colour (linear RGB) that the model shows at each sample.
 
     Albedo and the area-weighted vertex normals are interpolated perspective-correctly and shaded
-    by second-order spherical harmonics.
+    by second-order spherical harmonics, less what the face itself hides of the light where the
+    model has an ``occlusion`` (the paper's shading is that without).
     """
     vertices = model.shape(y.identity, y.expression)
     rotation = rotation_matrix(y.rotation)
@@ -121,7 +123,11 @@ def synthesize(
     normal = jnp.einsum("pi,pij->pj", weights, normals[used]) @ rotation.T
     normal = normal / jnp.maximum(safe_norm(normal, keepdims=True), 1e-12)
     albedo = jnp.einsum("pi,pij->pj", weights, model.reflectance(y.albedo)[used])
-    return albedo * irradiance(normal, y.light)
+    shading = irradiance(normal, y.light)
+    if model.occlusion is not None:
+        hidden = hidden_shading(model.occlusion, rotation, y.light)
+        shading = shading + jnp.einsum("pi,pij->pj", weights, hidden[used])
+    return albedo * shading
 
 
 def photometric_difference(y: FaceParameters, data: PhotometricData) -> Float[Array, "p 3"]:

@@ -8,6 +8,9 @@ with the weights held, the ray slides over the triangle by
 
 ``dc = (s grad a + D grad m) tau + D sum_i b_i dn_i``,  ``D = a * L^T H'(n) (I - n n^T)/|m|``.
 
+The shading hidden by the face itself, where the model knows it, is one more interpolated
+per-vertex colour in ``s``, linear in the light and turned with the head.
+
 Every geometric unknown enters by ``u`` and ``sum b_i dn_i`` alone: both are interpolated rows of
 bases, and the camera's own motion is written down directly. Forward autodiff of the same
 Jacobian carries the whole mesh through each of some 250 columns.
@@ -30,6 +33,7 @@ from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
+from jaxface.render.occlusion import hidden_shading, sh_rotation
 from jaxface.render.shading import irradiance, sh_basis
 
 
@@ -93,6 +97,10 @@ def photometric_jacobian(
     m_norm = jnp.maximum(jnp.sqrt(jnp.sum(m * m, axis=-1, keepdims=True)), 1e-12)
     n = m / m_norm
     shading = irradiance(n, y.light)
+    hidden = None
+    if model.occlusion is not None:
+        hidden = hidden_shading(model.occlusion, rotation, y.light)
+        shading = shading + _interpolate(b, hidden, tri)
 
     # D: colour change for a change of the interpolated normal m.
     per_axis = [
@@ -116,6 +124,8 @@ def photometric_jacobian(
         return first[:, :, None] * beta1[:, None, :] + second[:, :, None] * beta2[:, None, :]
 
     slope = shading[:, :, None] * plane_gradient(albedos) + d @ plane_gradient(normals)
+    if hidden is not None:
+        slope = slope + a[:, :, None] * plane_gradient(hidden[tri])
     g_dot_x = jnp.sum(g * x, axis=-1, keepdims=True)
     edge_on = g_dot_x == 0
     along = g / jnp.where(edge_on, 1.0, g_dot_x)
@@ -136,6 +146,12 @@ def photometric_jacobian(
 
     j_albedo = shading[:, :, None] * _interpolate(b, model.albedo.basis, tri)
     harmonics = sh_basis(n)
+    if model.occlusion is not None:
+        turn = sh_rotation(rotation)
+        harmonics = harmonics + _interpolate(b, model.occlusion @ turn.T, tri)
+        turned_light = jax.jacfwd(lambda w: sh_rotation(rotation_matrix(w)).T @ y.light)(y.rotation)
+        unlit = _interpolate(b, model.occlusion, tri)
+        j_rotation = j_rotation + a[:, :, None] * jnp.einsum("pk,kcw->pcw", unlit, turned_light)
     eye = jnp.eye(3, dtype=n.dtype)
     j_light = jnp.einsum("pc,pj,cd->pcjd", a, harmonics, eye).reshape(*a.shape, 27)
     jacobian = jnp.concatenate([j_shape, j_albedo, j_light, j_rotation, slope, j_focal], axis=-1)

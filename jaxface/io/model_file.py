@@ -78,6 +78,8 @@ def save_model(path: str | os.PathLike, model: MorphableModel, source: dict | No
     if model.quads is not None and model.uv_quads is not None:
         arrays["quads"] = np.asarray(model.quads, np.int32)
         arrays["uv_quads"] = np.asarray(model.uv_quads, np.int32)
+    if model.occlusion is not None:
+        arrays["occlusion"] = np.asarray(model.occlusion, np.float16)
     broken = [k for k, v in arrays.items() if v.dtype.kind == "f" and not np.isfinite(v).all()]
     if broken:
         raise ValueError(f"model {model.name!r} has non-finite values in {broken}")
@@ -149,6 +151,9 @@ def load_model(path: str | os.PathLike) -> MorphableModel:
         licence=metadata["licence"],
         quads=jnp.asarray(arrays["quads"], jnp.int32) if has_quads else None,
         uv_quads=jnp.asarray(arrays["uv_quads"], jnp.int32) if has_quads else None,
+        occlusion=(
+            jnp.asarray(arrays["occlusion"], jnp.float32) if "occlusion" in arrays else None
+        ),
     )
 
 
@@ -252,6 +257,8 @@ def _validate(arrays: dict[str, np.ndarray], metadata: dict, path: str | os.Path
     if "quads" in arrays or "uv_quads" in arrays:
         expect_index("quads", (None, 4), count, low=-1)
         expect_index("uv_quads", (len(arrays["quads"]), 4), corners, low=-1)
+    if "occlusion" in arrays:
+        expect("occlusion", (count, 9))
     for name, points in _LANDMARKS.items():
         if f"{name}_vertices" in arrays:
             expect_index(f"{name}_vertices", (points, 3), count)

@@ -48,6 +48,8 @@ class MorphableModel(eqx.Module):
     quads: Int[Array, "q 4"] | None = None
     """the same surface as quads (4th index -1: a triangle), where the source has them"""
     uv_quads: Int[Array, "q 4"] | None = None
+    occlusion: Float[Array, "n 9"] | None = None
+    """shading lost to self-occlusion (``render.occlusion``), of the mean face; None: no shadows"""
 
     @property
     def vertex_count(self) -> int:

@@ -72,6 +72,8 @@ def _refine_once(model: MorphableModel) -> MorphableModel:
         "quads": None if triangles_only else jnp.asarray(refined.quads, jnp.int32),
         "uv_quads": None if triangles_only else jnp.asarray(refined_uv.quads, jnp.int32),
     }
+    if model.occlusion is not None:
+        changes["occlusion"] = jnp.asarray(apply(np.asarray(model.occlusion)))
     for name in ("landmarks68", "landmarks468"):
         points = getattr(model, name)
         if points is not None:

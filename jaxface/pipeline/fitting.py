@@ -1,5 +1,6 @@
 """Photo -> fitted face: landmarks, model, crop and fit in sequence."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.models.subdivide import subdivide
 from jaxface.pipeline.clock import Clock, quick_compilation
+from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
     FitInput,
@@ -166,6 +168,14 @@ def _render_program(size: int) -> Any:
     return jax.jit(lambda y, model, principal: render_fit(y, model, principal, size))
 
 
+def _with_self_shadow(model: MorphableModel, wanted: bool) -> MorphableModel:
+    if not wanted:
+        return dataclasses.replace(model, occlusion=None)
+    if model.occlusion is not None:
+        return model
+    return dataclasses.replace(model, occlusion=self_occlusion(model.mean, model.faces))
+
+
 def detail_levels(
     model: MorphableModel, landmark_count: int, levels: int, details: Sequence[int] | None = None
 ) -> tuple[FitModel, ...]:
@@ -258,6 +268,7 @@ def fit(
     size: int = 512,
     details: Sequence[int] | None = None,
     extra_terms: Sequence[Term] = (),
+    self_shadow: bool = True,
     clock: Clock | None = None,
 ) -> FittedFace:
     """Fit a morphable model to a photo (Saito 2017, section 3).
@@ -274,6 +285,8 @@ def fit(
         size: side of the working image, px.
         details: subdivisions of the model at each level (``detail_levels``).
         extra_terms: your own terms, functions of ``(FaceParameters, FitData)``.
+        self_shadow: whether the shading lacks what the face hides from itself of the light
+            (``render.occlusion``, of the mean face); the paper's does not.
         clock: where times are noted.
 
     Raises:
@@ -296,6 +309,7 @@ def fit(
         if model.landmarks468 is None:
             landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
     landmarks = np.asarray(landmarks, np.float64)[:, :2]
+    model = clock.host("self-shadow", _with_self_shadow, model, self_shadow)
     models = clock.host("prepare model", detail_levels, model, len(landmarks), len(steps), details)
     linear = np.asarray(srgb_to_linear(jnp.asarray(seen.pixels)))
     focal = None

@@ -10,6 +10,7 @@ import numpy as np
 from jaxface._types import Array, Float
 from jaxface.geometry.uv import uv_layout
 from jaxface.pipeline.fitting import FittedFace
+from jaxface.stages.fit import fit_hidden_shading
 from jaxface.stages.unwrap import PartialAlbedo, complete_preview, unwrap
 
 
@@ -45,6 +46,7 @@ def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
         "unwrap", lambda: jax.block_until_ready(unwrap(
             jnp.asarray(cut * fitted.working.gain), jnp.asarray(mask),
             y.pose(fitted.vertices), model.faces, camera, y.light, layout,
+            fit_hidden_shading(y, model),
         )),
     )  # fmt: skip
     whole = clock.host(

@@ -43,6 +43,7 @@ def unwrap(
     camera: Camera,
     light: Float[Array, "9 3"],
     layout: UVLayout,
+    hidden: Float[Array, "n 3"] | None = None,
     *,
     grazing: tuple[float, float] = (75.0, 50.0),
     feather_width: float = 3.0,
@@ -71,6 +72,8 @@ def unwrap(
         camera: the photo's projection.
         light: shading coefficients in the camera's frame (see ``render.shading``).
         layout: from ``geometry.uv.uv_layout`` for the same triangles.
+        hidden: shading (negative) that the face takes from itself at each vertex, added to
+            ``H(n) L``; see ``render.occlusion``.
         grazing: angles between normal and view (degrees) where the weight reaches 0 and 1.
         feather_width: width of the soft edge inside the mask, px of the photo.
         shading_floor: smallest shading divided by, as a part of the mean over the vertices that
@@ -85,7 +88,7 @@ def unwrap(
     _check(photo, mask, faces, layout, grazing, shading_floor)
     cosines = jnp.cos(jnp.deg2rad(jnp.asarray(grazing, photo.dtype)))
     return _unwrap(
-        photo, mask, vertices, faces, camera, light, layout, cosines, shading_floor,
+        photo, mask, vertices, faces, camera, light, layout, hidden, cosines, shading_floor,
         feather_width=feather_width, depth_size=depth_size, tile=min(tile, layout.resolution),
     )  # fmt: skip
 
@@ -99,6 +102,7 @@ def _unwrap(
     camera: Camera,
     light: Array,
     layout: UVLayout,
+    hidden: Array | None,
     cosines: Array,
     shading_floor: Array,
     *,
@@ -118,7 +122,7 @@ def _unwrap(
         3 * jnp.sum(front), 1
     )
     floor = jax.lax.stop_gradient(jnp.maximum(shading_floor * lit, 1e-6))
-    table, alive = _triangles(vertices, normals, faces, camera, layout, (width, height))
+    table, alive = _triangles(vertices, normals, faces, camera, layout, (width, height), hidden)
 
     # Every quantity of a tile is one vector of texels per component: loops over a short last
     # axis are several times slower on a CPU, and the stacks below cost nothing once compiled.
@@ -142,6 +146,9 @@ def _unwrap(
         cover = sample[:, 3]
         basis = sh_basis(normal)
         shading = [sum(basis[:, k] * light[k, rgb] for k in range(9)) for rgb in range(3)]
+        if hidden is not None:
+            taken = across(22)
+            shading = [shading[rgb] + taken[:, rgb] for rgb in range(3)]
         darkest = jnp.minimum(jnp.minimum(shading[0], shading[1]), shading[2])
         weight = smoothstep(cosine, cosines[0], cosines[1]) * cover * seen
         weight = weight * smoothstep(darkest, floor, 2 * floor)
@@ -166,11 +173,13 @@ def _triangles(
     camera: Camera,
     layout: UVLayout,
     size: tuple[int, int],
+    hidden: Array | None,
 ) -> tuple[Array, Array]:
     """What a texel needs of its triangle, and which triangles the photo may show at all.
 
     A row holds a corner and two edges of the positions (9), the same of the normals (9), the
-    face normal (3) and the mipmap level (1): one look-up a texel instead of seven.
+    face normal (3), the mipmap level (1) and, if there is one, corner and edges of the hidden
+    shading (9): one look-up a texel instead of seven.
     """
     corner = vertices[faces]
     screen = camera.project(corner)
@@ -182,10 +191,14 @@ def _triangles(
     b, c = screen[:, 1, :2] - screen[:, 0, :2], screen[:, 2, :2] - screen[:, 0, :2]
     pixels = 0.5 * jnp.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     level = 0.5 * jnp.log2(jnp.maximum(pixels, 1e-12) / jnp.maximum(layout.area, 1e-12))
-    parts = []
-    for values in (corner, normals[faces]):
-        parts += [values[:, 0], values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]]
-    return jnp.concatenate([*parts, safe_normalize(flat), level[:, None]], axis=-1), alive
+
+    def edges(values: Array) -> list[Array]:
+        return [values[:, 0], values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]]
+
+    parts = [*edges(corner), *edges(normals[faces]), safe_normalize(flat), level[:, None]]
+    if hidden is not None:
+        parts += edges(hidden[faces])
+    return jnp.concatenate(parts, axis=-1), alive
 
 
 def _by_tiles(texels, layout: UVLayout, alive: Array, tile: int, dtype) -> PartialAlbedo:

@@ -12,7 +12,7 @@ from jaxface.stages.fit.records import (
     FitWeights,
     join_records,
 )
-from jaxface.stages.fit.rendering import FitRender, render_fit, skin_map
+from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
 from jaxface.stages.fit.solve import fit_energy, fit_level, fit_parameters, fit_start
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "WorkingPhoto",
     "fit_batch",
     "fit_energy",
+    "fit_hidden_shading",
     "fit_level",
     "fit_parameters",
     "fit_start",

@@ -8,8 +8,10 @@ from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.resample import resize
+from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.render.interpolate import interpolate
+from jaxface.render.occlusion import hidden_shading
 from jaxface.render.rasterize import Fragments, rasterize
 from jaxface.render.shading import irradiance
 from jaxface.stages.fit.inliers import inlier_weights
@@ -38,16 +40,25 @@ def render_fit(
     screen = y.camera(principal, size).project(vertices @ rotation.T + y.translation)
     faces = model.model.faces
     fragments = rasterize(screen, faces, size, size, cull=True)
+    hidden = fit_hidden_shading(y, model.model)
     per_vertex = jnp.concatenate(
-        [vertex_normals(vertices, faces), model.model.reflectance(y.albedo)], axis=1
+        [vertex_normals(vertices, faces), model.model.reflectance(y.albedo), hidden], axis=1
     )
     at_pixel = interpolate(per_vertex, faces, fragments)
     normal = at_pixel[..., :3] @ rotation.T
     normal = normal / jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     covered = fragments.triangle >= 0
-    color = jnp.where(covered[..., None], at_pixel[..., 3:] * irradiance(normal, y.light), 0.0)
+    albedo, shading = at_pixel[..., 3:6], irradiance(normal, y.light) + at_pixel[..., 6:]
+    color = jnp.where(covered[..., None], albedo * shading, 0.0)
     skin = covered & model.face_mask[jnp.maximum(fragments.triangle, 0)]
-    return FitRender(color, at_pixel[..., 3:], normal, fragments, skin)
+    return FitRender(color, albedo, normal, fragments, skin)
+
+
+def fit_hidden_shading(y: FaceParameters, model: MorphableModel) -> Float[Array, "n 3"]:
+    """Shading (negative) that the face's own parts take from each vertex under the fitted light."""
+    if model.occlusion is None:
+        return jnp.zeros((model.vertex_count, 3), y.light.dtype)
+    return hidden_shading(model.occlusion, rotation_matrix(y.rotation), y.light)
 
 
 def skin_map(

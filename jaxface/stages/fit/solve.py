@@ -35,6 +35,7 @@ from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.pyramid import pyramid
 from jaxface.imaging.resample import bilinear
 from jaxface.models.parameters import FaceParameters, neutral_parameters
+from jaxface.render.occlusion import sh_rotation
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import sh_basis
 from jaxface.solvers.gauss_newton import Problem, gauss_newton
@@ -260,9 +261,9 @@ def initial_light(
 ) -> FaceParameters:
     """Light in closed form: linear least squares over the vertices, shape and albedo held.
 
-    Vertices count by how much they face the camera; occlusion is ignored, which is good enough
-    for a start. The upper bands are damped (a ridge of 0.02 of the ambient column), as a face
-    shows only half the sphere of normals.
+    Vertices count by how much they face the camera; whether another part of the face hides them
+    from it is ignored, which is good enough for a start. The upper bands are damped (a ridge of
+    0.02 of the ambient column), as a face shows only half the sphere of normals.
     """
     size = image.shape[0]
     shape = model.model.shape(y.identity, y.expression)
@@ -275,7 +276,10 @@ def initial_light(
     seen = bilinear(jnp.concatenate([image, mask[..., None]], axis=-1), screen)
     weight = facing * seen[:, 3] * model.vertex_mask
     weight = weight / jnp.maximum(jnp.sum(weight), 1e-6)
-    columns = sh_basis(normal)[:, None, :] * model.model.reflectance(y.albedo)[:, :, None]
+    harmonics = sh_basis(normal)
+    if model.model.occlusion is not None:
+        harmonics = harmonics + model.model.occlusion @ sh_rotation(rotation).T
+    columns = harmonics[:, None, :] * model.model.reflectance(y.albedo)[:, :, None]
     gram = jnp.einsum("n,nci,ncj->cij", weight, columns, columns)
     rhs = jnp.einsum("n,nci,nc->ci", weight, columns, seen[:, :3])
     ridge = jnp.diag(jnp.array([1e-4] + [0.02] * 8, gram.dtype))
