@@ -1,0 +1,17 @@
+"""Blend the feature statistics of a database's faces into those of a photo (Saito 2017, section 4)."""
+
+from jaxface.stages.blend.baselines import nearest_subject, unconstrained
+from jaxface.stages.blend.mixing import blended_grams
+from jaxface.stages.blend.solve import Blend, blend, blend_reduced, reduce_database
+from jaxface.stages.blend.weights import blend_weights
+
+__all__ = [
+    "Blend",
+    "blend",
+    "blend_reduced",
+    "blend_weights",
+    "blended_grams",
+    "nearest_subject",
+    "reduce_database",
+    "unconstrained",
+]
