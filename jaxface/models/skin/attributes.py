@@ -75,7 +75,7 @@ def random_attributes(key: Array) -> SkinAttributes:
         haemoglobin=0.02 + 0.06 * normal(),
         tone=0.6 * jax.random.truncated_normal(next(keys), -2.0, 2.0, (ALBEDO_MODES,)),
         mottling=jnp.exp(0.25 * normal()),
-        pores=jnp.exp(0.3 * normal()) * (0.85 + 0.25 * male),
+        pores=jnp.exp(0.22 * normal()) * (0.9 + 0.2 * male),
         furrows=jnp.exp(0.25 * normal()) * (0.8 + 0.5 * old),
         wrinkles=jnp.clip(old * 1.1 + 0.12 * normal(), 0.0, 1.0) ** 1.2,
         freckles=fair * uniform() ** 2.5,

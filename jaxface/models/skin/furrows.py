@@ -12,7 +12,7 @@ from jaxface.models.skin.rows import Row, dot
 
 CELLS = (1.25, 0.7)
 """size of the cells (mm) of the coarse and of the fine network"""
-STRENGTHS = (0.07, 0.07)
+STRENGTHS = (0.09, 0.075)
 STRETCH = 0.5
 """share by which squared distances along the lines of tension count less"""
 EDGE = 0.3

@@ -73,7 +73,7 @@ def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> D
         (0.12, 0.12 + 0.36 * grown), HALF_WIDTH, layer_seed(seed, 52), layers=3,
     )  # fmt: skip
     dark = (0.3 + 0.7 * traits.hair_melanin) * where**0.5
-    hairs = 1.1 * (0.35 + 0.65 * traits.stubble) * dark * hairs
+    hairs = 1.35 * (0.35 + 0.65 * traits.stubble) * dark * hairs
     shadow = 0.17 * traits.stubble * dark * where
     # Roots seen through the skin look blue: melanin's share is negative to take away yellow.
     return Density(0.25 * hairs - 0.5 * shadow, -0.15 * shadow, 0.75 * hairs + 1.4 * shadow)
@@ -92,11 +92,11 @@ def brows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
     direction = jax.lax.optimization_barrier(tuple(d * inverse for d in flat))
     where = jnp.clip(1.5 * patch.regions.brow - 0.25, 0.0, 1.0)
     hairs = _strokes(
-        patch, direction, BROW_CELL, where, jnp.zeros_like(x), 0.9, (1.2, 2.4), 0.1,
-        layer_seed(seed, 60), layers=14,
+        patch, direction, BROW_CELL, where, jnp.zeros_like(x), 0.9, (1.2, 2.4), 0.12,
+        layer_seed(seed, 60), layers=16,
     )  # fmt: skip
     amount = (0.4 + 0.6 * traits.hair_melanin) * (0.7 + 0.3 * traits.male)
-    return Density(0.25 * amount * hairs, 0.0, 0.65 * amount * hairs)
+    return Density(0.3 * amount * hairs, 0.0, 0.8 * amount * hairs)
 
 
 def scalp_roots(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:

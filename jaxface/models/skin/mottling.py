@@ -11,9 +11,9 @@ from jaxface.models.skin.rows import smoothstep
 
 WAVES = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.55)
 """mm"""
-BLOOD = (0.030, 0.024, 0.020, 0.017, 0.014, 0.010, 0.008)
+BLOOD = (0.034, 0.028, 0.024, 0.024, 0.020, 0.012, 0.008)
 """standard deviation of the density of each wave"""
-MELANIN = (0.026, 0.018, 0.015, 0.013, 0.011, 0.009, 0.008)
+MELANIN = (0.026, 0.020, 0.018, 0.018, 0.016, 0.010, 0.007)
 
 
 def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:

@@ -36,8 +36,8 @@ def pores(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
 
         return gather_spots(patch.position, patch.normal, cell, layer_seed(seed, layer), shade)
 
-    large = dots(LARGE_CELL, 0.15 + 0.75 * strong, (0.22 + 0.2 * strong) * size, 10)
-    small = dots(SMALL_CELL, 0.5 + 0.4 * strong, (0.2 + 0.04 * strong) * size, 11)
+    large = dots(LARGE_CELL, 0.25 + 0.7 * strong, (0.17 + 0.13 * strong) * size, 10)
+    small = dots(SMALL_CELL, 0.5 + 0.4 * strong, (0.17 + 0.03 * strong) * size, 11)
     # Sebum and shadow darken the mouth of a pore; a faint red rim lies around the larger.
-    depth = bare * traits.pores * (0.75 * strong * large + 0.24 * small)
+    depth = bare * size * (0.6 * strong * large + 0.36 * small)
     return Density(0.4 * depth, 0.35 * depth, 0.4 * depth)

@@ -12,6 +12,8 @@ from jaxface.geometry.mesh import vertex_neighbours, vertex_normals
 from jaxface.models.morphable import MorphableModel
 
 NOT_SKIN = ("eyes", "mouth_interior")
+RIM_RINGS = 3
+"""rings of vertices inside the mouth that are lip"""
 
 
 class Regions(eqx.Module):
@@ -91,15 +93,20 @@ def _regions(
         mask = np.asarray(model.region_mask(*known), np.float64)
         return _smooth(mask, neighbours, passes)
 
+    # The lips go on a little way into the mouth.
+    interior, rim = named("mouth_interior", passes=0), named("lips", passes=0)
+    for _ in range(RIM_RINGS):
+        rim = np.maximum(rim, interior * (_smooth(rim, neighbours, 1) > 0))
+
     x, y, z = position.T
     front = _step(z, marks[0, 2], marks[0, 2] + 30)
-    skin = 1 - named(*NOT_SKIN, passes=0)
-    lips = named("lips", passes=1)
+    skin = np.maximum(1 - named(*NOT_SKIN, passes=0), rim)
+    lips = _smooth(rim, neighbours, 2)
     lid = named("eyelids", passes=2) * skin
     eye = 0.5 * (marks[36:42].mean(0) + marks[42:48].mean(0))
     nose = np.maximum(
-        _near(position, _polyline(marks[28:31]), 8.0),
-        _near(position, _polyline(marks[31:36] + [0, 4, 0]), 7.0),
+        _near(position, _polyline(marks[28:31]), 10.0),
+        _near(position, _polyline(marks[31:36] + [0, 4, 0]), 9.0),
     )
     cheeks, under = [], []
     for lower, corner, jaw, side in ((41, 48, 2, -1), (46, 54, 14, 1)):

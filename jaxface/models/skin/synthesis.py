@@ -20,7 +20,7 @@ from jaxface.models.skin.patch import SkinPatch, patch_at
 from jaxface.models.skin.pigments import Density, absorb
 from jaxface.models.skin.pores import pores
 from jaxface.models.skin.regions import SkinFields, skin_fields
-from jaxface.models.skin.rows import Vector
+from jaxface.models.skin.rows import Vector, smoothstep
 from jaxface.models.skin.wrinkles import wrinkles
 
 Layer = Callable[[SkinPatch, SkinAttributes, Int[Array, ""]], Density]
@@ -68,7 +68,7 @@ def _texture(
     fields: SkinFields,
 ) -> Float[Array, "r r 3"]:
     side, seed = layout.resolution, mix(seed)
-    base = base_albedo(model, attributes)
+    base = base_albedo(model, attributes, fields)
     count = side * side
     run = min(RUN, count)
     padding = -count % run
@@ -92,22 +92,30 @@ def _texture(
     return fill_outside(colour, layout.triangle >= 0)
 
 
-def base_albedo(model: MorphableModel, attributes: SkinAttributes) -> Float[Array, "n 3"]:
-    """The model's mean albedo with the subject's tone, and lips of one colour.
+def base_albedo(
+    model: MorphableModel, attributes: SkinAttributes, fields: SkinFields
+) -> Float[Array, "n 3"]:
+    """The model's mean albedo with the subject's tone, and cleaner lips and lids.
 
-    The first mode, overall darkness, is left to the pigments.
+    The first mode, overall darkness, is left to the pigments. Averaged textures mix teeth and
+    shadow into the lips, whose colour is drawn together here, and paint the inside of the lids
+    in a plain red, which becomes a flushed skin.
     """
     modes = min(model.albedo.count - 1, attributes.tone.shape[0])
     tone = jnp.zeros(model.albedo.count)
     if modes > 0:
         tone = tone.at[1 : 1 + modes].set(attributes.tone[:modes])
     albedo = jnp.clip(model.reflectance(tone), 0.004, 1.0)
-    if "lips" not in model.region_names:
-        return albedo
-    # Averaged textures mix teeth and shadow into the lips' inner rim.
-    inside = model.region_mask("lips").astype(albedo.dtype)[:, None]
-    middle = jnp.sum(albedo * inside, axis=0) / jnp.maximum(jnp.sum(inside), 1.0)
-    return albedo + 0.7 * inside * (middle - albedo)
+    r = fields.regions
+
+    def mean_over(weight: Float[Array, "n"]) -> Float[Array, "3"]:
+        return weight @ albedo / jnp.maximum(jnp.sum(weight), 1e-6)
+
+    lip, cheek = mean_over(r.lips * (r.lips > 0.9)), mean_over(r.cheek)
+    albedo = albedo + (0.8 * r.lips)[:, None] * (0.8 * lip + 0.2 * cheek - albedo)
+    redness = albedo[:, 0] / albedo[:, 1] - cheek[0] / cheek[1]
+    sore = smoothstep(redness, 0.3, 1.0) * (1 - r.lips) * r.skin
+    return albedo + (0.85 * sore)[:, None] * (jnp.array([0.85, 0.62, 0.6]) * cheek - albedo)
 
 
 def _skin(patch: SkinPatch, base: Vector, traits: SkinAttributes, seed: Int[Array, ""]) -> Vector:

@@ -31,8 +31,8 @@ class _Bends(NamedTuple):
 
 def wrinkles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of all wrinkles."""
-    bend = 1.3 * gradient_noise(patch.position, 26.0, layer_seed(seed, 100))
-    bend = bend + 0.45 * gradient_noise(patch.position, 7.0, layer_seed(seed, 101))
+    bend = 1.4 * gradient_noise(patch.position, 26.0, layer_seed(seed, 100))
+    bend = bend + 0.22 * gradient_noise(patch.position, 8.0, layer_seed(seed, 101))
     broken = 0.65 + 0.45 * gradient_noise(patch.position, 14.0, layer_seed(seed, 102))
     bends = _Bends(bend, jnp.clip(broken, 0.1, 1.3))
     # Loops, for one line is compiled then, and none is computed once for every pigment.
@@ -50,7 +50,7 @@ def _line(patch: SkinPatch, distance: Row, width: float, strength: Row) -> Row:
     """A thin line in a valley four times as wide, ``distance`` mm from its middle."""
     thin = width + 0.5 * patch.texel
     core = _bump(distance / thin) * (width / thin)
-    return strength * (core + 0.3 * _bump(distance * (0.25 / width)))
+    return strength * (0.7 * core + 0.45 * _bump(distance * (0.25 / width)))
 
 
 def _bump(x: Row) -> Row:
