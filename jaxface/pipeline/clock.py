@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import PyTree
+from jaxface.pipeline.programs import kept_program
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,8 +61,28 @@ def _compiled(program: Any, *args: PyTree) -> Any:
     shapes = tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
     key = (program, structure, shapes)
     if key not in _PROGRAMS:
-        _PROGRAMS[key] = program.lower(*args).compile()
+        if isinstance(program, KeptProgram):
+            flat = jax.jit(
+                kept_program(program.name, program.function, *args),
+                compiler_options=program.compiler_options,
+            )
+            compiled = flat.lower(*leaves).compile()
+            _PROGRAMS[key] = lambda *args: compiled(*jax.tree.leaves(args))
+        else:
+            _PROGRAMS[key] = program.lower(*args).compile()
     return _PROGRAMS[key]
+
+
+class KeptProgram(NamedTuple):
+    """A function whose traced program is kept between processes (``kept_program``)."""
+
+    name: str
+    function: Callable[..., PyTree]
+    compiler_options: Any = None
+
+    def __hash__(self) -> int:
+        """By name and function: options are a dict."""
+        return hash((self.name, self.function))
 
 
 def quick_compilation() -> dict[str, Any]:

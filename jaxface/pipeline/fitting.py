@@ -21,7 +21,8 @@ from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.clock import Clock, quick_compilation
+from jaxface.pipeline.clock import Clock, KeptProgram, quick_compilation
+from jaxface.pipeline.programs import keep_structure
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
@@ -30,6 +31,7 @@ from jaxface.stages.fit import (
     FitRender,
     FitStats,
     FitWeights,
+    LevelRecord,
     Posterior,
     WorkingPhoto,
     fit_level,
@@ -123,13 +125,14 @@ class FittedFace:
 
 
 @functools.cache
-def _start_program() -> Any:
-    return jax.jit(fit_start, compiler_options=quick_compilation())
+def _start_program() -> KeptProgram:
+    return KeptProgram("fit_start", fit_start, quick_compilation())
 
 
 @functools.cache
-def _level_program(level: int) -> Any:
-    return jax.jit(functools.partial(fit_level, level=level), compiler_options=quick_compilation())
+def _level_program(level: int) -> KeptProgram:
+    function = functools.partial(fit_level, level=level)
+    return KeptProgram(f"fit_level_{level}", function, quick_compilation())
 
 
 def _fit_levels(
@@ -142,6 +145,8 @@ def _fit_levels(
     """``fit_parameters``, a program a level, so that they compile side by side."""
     programs = [_level_program(level) for level in range(len(models))]
     y = jax.eval_shape(neutral_parameters, models[0].model)
+    keep_structure(y)
+    keep_structure(LevelRecord({}, y.log_focal, y.identity))
     calls = [(_start_program(), (data, models[0], weights, config))]
     calls += [(p, (y, data, m, weights, config)) for p, m in zip(programs, models, strict=True)]
     clock.prepare("fit", calls)

@@ -10,6 +10,7 @@ from jaxface.stages.fit.records import (
     FitInput,
     FitStats,
     FitWeights,
+    LevelRecord,
     join_records,
 )
 from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
@@ -23,6 +24,7 @@ __all__ = [
     "FitRender",
     "FitStats",
     "FitWeights",
+    "LevelRecord",
     "Posterior",
     "WorkingPhoto",
     "fit_batch",
