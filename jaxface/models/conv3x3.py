@@ -1,0 +1,214 @@
+"""The 3x3 convolution of VGG-like networks, as a JAX primitive with a fast CPU lowering.
+
+``conv3x3`` is one linear operation to JAX: it differentiates in both modes to any order, and maps.
+How it is computed is decided when a program is lowered: on CPUs by Winograd's minimal filtering
+(``winograd``), for the first layer by ``shifted_sum``, elsewhere by ``lax.conv_general_dilated``.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.extend.core
+import jax.numpy as jnp
+from jax import lax
+from jax.interpreters import ad, batching, mlir
+
+from jaxface._types import Array, Float
+from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
+from jaxface.models.winograd import winograd_conv3x3
+
+METHODS = ("auto", "winograd", "direct")
+"""``auto``: on CPUs by Winograd, or by shifted sums for the first layer; direct elsewhere"""
+
+_NARROW, _WIDE = 2, 16
+"""on CPUs ``auto`` means shifted sums up to the one, Winograd from the other number of channels"""
+
+
+def conv3x3(
+    x: Float[Array, "h w i"], kernel: Float[Array, "3 3 i o"], method: str = "auto"
+) -> Float[Array, "h w o"]:
+    """Correlation with a 3x3 kernel (HWIO), zeros outside the image.
+
+    Raises:
+        ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
+    """
+    _check(x, kernel, method)
+    no_gate = jnp.zeros((), bool)
+    return _linear_p.bind(x, kernel, no_gate, gated="no", transpose=False, method=method)
+
+
+def conv3x3_relu(
+    x: Float[Array, "h w i"],
+    kernel: Float[Array, "3 3 i o"],
+    bias: Float[Array, "o"],
+    method: str = "auto",
+) -> Float[Array, "h w o"]:
+    """``max(conv3x3(x, kernel) + bias, 0)``; the derivative at 0 is 0.
+
+    Bias, ReLU and, in the backward pass, the ReLU's gate cost no pass over memory of their own.
+
+    Raises:
+        ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
+    """
+    _check(x, kernel, method)
+    return _LAYERS[method](x, kernel, bias)
+
+
+def _check(x: Array, kernel: Array, method: str) -> None:
+    if x.ndim != 3 or kernel.shape[:3] != (3, 3, x.shape[-1]):
+        raise ValueError(
+            f"image {x.shape} and kernel {kernel.shape} do not fit: needed are (h, w, i) and "
+            "(3, 3, i, o)"
+        )
+    if method not in METHODS:
+        raise ValueError(f"method is {method!r}; needed is one of {METHODS}")
+
+
+def direct_conv3x3(
+    x: Float[Array, "h w i"], kernel: Float[Array, "3 3 i o"], transpose: bool = False
+) -> Float[Array, "h w o"]:
+    """The same by ``lax.conv_general_dilated``; ``transpose``: the adjoint, from o channels to i."""
+    if transpose:
+        kernel = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
+    layout = ("NHWC", "HWIO", "NHWC")
+    return lax.conv_general_dilated(x[None], kernel, (1, 1), "SAME", dimension_numbers=layout)[0]
+
+
+def _algorithm(kernel: Array, method: str, platform: str) -> str:
+    if method != "auto":
+        return method
+    if platform == "cpu" and kernel.shape[2] <= _NARROW:
+        return "shifted sum"
+    return "winograd" if platform == "cpu" and min(kernel.shape[2:]) >= _WIDE else "direct"
+
+
+def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array]) -> None:
+    """Shape, compilation and mapping of a primitive that ``compute`` carries out."""
+
+    def shape(x: Any, kernel: Any, _: Any, *, transpose: bool = False, **how: Any) -> Any:
+        channels = kernel.shape[2 if transpose else 3]
+        return jax.core.ShapedArray((*x.shape[:-1], channels), x.dtype)
+
+    def batched(args: Any, dims: Any, **how: Any) -> Any:
+        size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
+
+        def one(i: Array) -> Array:
+            picked = [
+                a if d is None else lax.dynamic_index_in_dim(a, i, d, keepdims=False)
+                for a, d in zip(args, dims, strict=True)
+            ]
+            return primitive.bind(*picked, **how)
+
+        return lax.map(one, jnp.arange(size)), 0
+
+    def lowering(platform: str) -> Any:
+        return mlir.lower_fun(functools.partial(compute, platform=platform), False)
+
+    primitive.def_abstract_eval(shape)
+    primitive.def_impl(
+        lambda *arrays, **how: jax.jit(functools.partial(primitive.bind, **how))(*arrays)
+    )
+    batching.primitive_batchers[primitive] = batched
+    mlir.register_lowering(primitive, lowering("any"))
+    mlir.register_lowering(primitive, lowering("cpu"), "cpu")
+
+
+# A convolution linear in image and kernel, with a gate: the image ("input") or the result
+# ("output") counts only where the third operand is true. Transposing swaps the two.
+
+_linear_p = jax.extend.core.Primitive("conv3x3")
+_OPPOSITE = {"no": "no", "input": "output", "output": "input"}
+
+
+def _linear(
+    x: Array, kernel: Array, gate: Array, *, gated: str, transpose: bool, method: str, platform: str
+) -> Array:
+    algorithm = _algorithm(kernel, method, platform)
+    if gated == "input" and algorithm != "winograd":
+        x = jnp.where(gate, x, 0)
+    if algorithm == "winograd":
+        input_gate = gate if gated == "input" else None
+        y = winograd_conv3x3(x, kernel, gate=input_gate, transpose=transpose)
+    elif algorithm == "shifted sum":
+        y = (shifted_sum_conv3x3_transpose if transpose else shifted_sum_conv3x3)(x, kernel)
+    else:
+        y = direct_conv3x3(x, kernel, transpose)
+    return jnp.where(gate, y, 0) if gated == "output" else y
+
+
+def _linear_jvp(primals: Any, tangents: Any, **how: Any) -> Any:
+    x, kernel, gate = primals
+    dx, dkernel, _ = tangents
+    y = _linear_p.bind(x, kernel, gate, **how)
+    dy = ad.Zero.from_primal_value(y)
+    if not isinstance(dx, ad.Zero):
+        dy = ad.add_tangents(dy, _linear_p.bind(dx, kernel, gate, **how))
+    if not isinstance(dkernel, ad.Zero):
+        dy = ad.add_tangents(dy, _linear_p.bind(x, dkernel, gate, **how))
+    return y, dy
+
+
+def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, **how: Any) -> Any:
+    if isinstance(ct, ad.Zero):
+        return [None, None, None]
+    if ad.is_undefined_primal(x):
+        back = how | {"gated": _OPPOSITE[how["gated"]], "transpose": not how["transpose"]}
+        return [_linear_p.bind(ct, kernel, gate, **back), None, None]
+
+    def of_kernel(k: Array) -> Array:
+        return _linear(x, k, gate, **(how | {"method": "direct"}), platform="any")
+
+    shape = jax.ShapeDtypeStruct(kernel.aval.shape, kernel.aval.dtype)
+    return [None, jax.linear_transpose(of_kernel, shape)(ct)[0], None]
+
+
+_register(_linear_p, _linear)
+ad.primitive_jvps[_linear_p] = _linear_jvp
+ad.primitive_transposes[_linear_p] = _linear_transpose
+
+
+# The whole layer. The primitive has no derivative; the custom rule around it gives it one.
+
+_layer_p = jax.extend.core.Primitive("conv3x3_relu")
+
+
+def _layer(x: Array, kernel: Array, bias: Array, *, method: str, platform: str) -> Array:
+    algorithm = _algorithm(kernel, method, platform)
+    if algorithm == "winograd":
+        return winograd_conv3x3(x, kernel, bias)
+    if algorithm == "shifted sum":
+        return shifted_sum_conv3x3(x, kernel, bias)
+    return jnp.maximum(direct_conv3x3(x, kernel) + bias, 0)
+
+
+_register(_layer_p, _layer)
+
+
+def _layer_by(method: str) -> Callable[[Array, Array, Array], Array]:
+    @jax.custom_jvp
+    def layer(x: Array, kernel: Array, bias: Array) -> Array:
+        return _layer_p.bind(x, kernel, bias, method=method)
+
+    def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        x, kernel, bias = primals
+        dx, dkernel, dbias = tangents
+        y = layer(x, kernel, bias)
+        active = y > 0  # all that a backward pass needs to keep of y: a byte for each value
+        how = {"gated": "output", "transpose": False, "method": method}
+        zero = jax.custom_derivatives.SymbolicZero
+        parts = []
+        if not isinstance(dx, zero):
+            parts.append(_linear_p.bind(dx, kernel, active, **how))
+        if not isinstance(dkernel, zero):
+            parts.append(_linear_p.bind(x, dkernel, active, **how))
+        if not isinstance(dbias, zero):
+            parts.append(jnp.where(active, dbias, 0))
+        return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)
+
+    layer.defjvp(rule, symbolic_zeros=True)
+    return layer
+
+
+_LAYERS = {method: _layer_by(method) for method in METHODS}
