@@ -20,6 +20,7 @@ from jaxface.io.landmark_file import read_landmarks
 from jaxface.io.models import load_model
 from jaxface.io.obj import ObjMesh, read_obj
 from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
 from jaxface.models.linear import LinearBasis, empty_basis
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.skin.regions import skin_fields
@@ -29,6 +30,9 @@ from jaxface.stages.texture_transfer import resample_texture, texel_colours
 
 _HEIGHT = 280.0
 """mm, first guess of a scan's height, for the landmark detector"""
+_LANDMARK_STD = 3.0
+"""mm, of a detected point of the face"""
+_STIFFNESS = (50.0, 35.0, 25.0, 18.0, 12.0, 8.0, 5.0, 3.0, 2.0)
 _COLOUR_SIDE = 512
 """px, to which an albedo is reduced before it colours vertices"""
 
@@ -98,16 +102,22 @@ def register_scan(
     if points is None:
         raise ValueError(f"model {model.name!r} has no {len(marks)} landmarks")
     combine = _matrix(points, model.vertex_count)
-    start, scale, rotation, shift = _likely_shape(model, points, marks)
+    # Points of the outline are where a view ended, not places of the skin.
+    outline = FACE_OVAL if len(marks) == 468 else JAW_68
+    trusted = ~np.isin(np.arange(len(marks)), list(outline))
+    start, scale, rotation, shift, inlier = _likely_shape(model, points, marks, trusted)
     placed = scale * scan.vertices @ rotation.T + shift
     targets = scale * marks @ rotation.T + shift
-    skin = np.asarray(skin_fields(model).regions.skin) > 0
+    fields = skin_fields(model)
+    skin = np.asarray(fields.regions.skin) > 0
     kept, used = _cut(np.asarray(model.faces), skin)
     own = sparse.csr_matrix(combine[:, used])
-    whole = np.asarray(own.sum(1)).ravel() > 0.999
+    whole = (np.asarray(own.sum(1)).ravel() > 0.999) & inlier
+    ears = np.asarray(fields.regions.ear)[used]
     found: Registration = non_rigid_icp(
         start[used], kept, placed, scan.faces, landmarks=own[whole],
-        landmark_targets=targets[whole], reach=25.0, on_progress=on_progress,
+        landmark_targets=targets[whole], stiffness=_STIFFNESS,
+        vertex_weights=np.clip(1 - 1.5 * ears, 0, 1), reach=25.0, max_angle=50.0, on_progress=on_progress,
     )  # fmt: skip
     vertices = np.full((model.vertex_count, 3), np.nan)
     vertices[used] = found.vertices
@@ -234,28 +244,34 @@ def _detected(scan: ObjMesh, albedo: str | os.PathLike[str] | None) -> np.ndarra
 
 
 def _likely_shape(
-    model: MorphableModel, points: SurfacePoints, marks: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """The model's identity nearest to the landmarks, and the scan's place in its frame.
+    model: MorphableModel, points: SurfacePoints, marks: np.ndarray, trusted: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, np.ndarray]:
+    """The model's identity nearest to the landmarks, the scan's place in its frame, the inliers.
 
     Identity and similarity in turn: ridge regression of the coefficients with a unit Gaussian
-    prior and landmarks good to 2 mm.
+    prior and landmarks good to `_LANDMARK_STD`, each weighted by how well it agrees so far
+    (Geman and McClure's robust weights).
     """
     count = model.identity.count
     basis = np.asarray(model.identity.basis, np.float64)
     corners, weights = np.asarray(points.vertices), np.asarray(points.weights, np.float64)
-    columns = np.einsum("li,lick->lck", weights, basis[corners]).reshape(-1, count)
+    columns = np.einsum("li,lick->lck", weights, basis[corners])
     mean = np.einsum("li,lic->lc", weights, np.asarray(model.mean, np.float64)[corners])
-    z = np.zeros(count)
-    placement = similarity(marks, mean)
-    for _ in range(5):
+    z, inlier = np.zeros(count), trusted.astype(np.float64)
+    placement = similarity(marks[trusted], mean[trusted])
+    for _ in range(12):
         scale, rotation, shift = placement
-        aim = (scale * marks @ rotation.T + shift - mean).reshape(-1) / 2.0
-        a = columns / 2.0
-        z = np.linalg.solve(a.T @ a + np.eye(count), a.T @ aim)
-        placement = similarity(marks, mean + (columns @ z).reshape(-1, 3))
+        placed = scale * marks @ rotation.T + shift
+        error = np.sum((mean + columns @ z - placed) ** 2, axis=1)
+        inlier = trusted / (1 + error / (3 * _LANDMARK_STD) ** 2) ** 2
+        root = np.sqrt(inlier)[:, None] / _LANDMARK_STD
+        a = (columns * root[..., None]).reshape(-1, count)
+        b = ((placed - mean) * root).reshape(-1)
+        z = np.linalg.solve(a.T @ a + np.eye(count), a.T @ b)
+        good = inlier > 0.3
+        placement = similarity(marks[good], (mean + columns @ z)[good])
     shape = np.asarray(model.mean, np.float64) + basis @ z
-    return shape, *placement
+    return shape, *placement, inlier > 0.3
 
 
 def _matrix(points: SurfacePoints, count: int) -> sparse.csr_matrix:
