@@ -69,7 +69,7 @@ def _check(x: Array, kernel: Array, method: str) -> None:
 def direct_conv3x3(
     x: Float[Array, "h w i"], kernel: Float[Array, "3 3 i o"], transpose: bool = False
 ) -> Float[Array, "h w o"]:
-    """The same by ``lax.conv_general_dilated``; ``transpose``: the adjoint, from o channels to i."""
+    """The same by ``lax.conv_general_dilated``, or its adjoint (from o channels to i)."""
     if transpose:
         kernel = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
     layout = ("NHWC", "HWIO", "NHWC")
@@ -141,13 +141,13 @@ def _linear(
 def _linear_jvp(primals: Any, tangents: Any, **how: Any) -> Any:
     x, kernel, gate = primals
     dx, dkernel, _ = tangents
-    y = _linear_p.bind(x, kernel, gate, **how)
-    dy = ad.Zero.from_primal_value(y)
+    parts = []
     if not isinstance(dx, ad.Zero):
-        dy = ad.add_tangents(dy, _linear_p.bind(dx, kernel, gate, **how))
+        parts.append(_linear_p.bind(dx, kernel, gate, **how))
     if not isinstance(dkernel, ad.Zero):
-        dy = ad.add_tangents(dy, _linear_p.bind(x, dkernel, gate, **how))
-    return y, dy
+        parts.append(_linear_p.bind(x, dkernel, gate, **how))
+    y = _linear_p.bind(x, kernel, gate, **how)
+    return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)
 
 
 def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, **how: Any) -> Any:
@@ -157,8 +157,12 @@ def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, **how: Any) -> An
         back = how | {"gated": _OPPOSITE[how["gated"]], "transpose": not how["transpose"]}
         return [_linear_p.bind(ct, kernel, gate, **back), None, None]
 
+    gated, transpose = how["gated"], how["transpose"]
+
     def of_kernel(k: Array) -> Array:
-        return _linear(x, k, gate, **(how | {"method": "direct"}), platform="any")
+        return _linear(
+            x, k, gate, gated=gated, transpose=transpose, method="direct", platform="any"
+        )
 
     shape = jax.ShapeDtypeStruct(kernel.aval.shape, kernel.aval.dtype)
     return [None, jax.linear_transpose(of_kernel, shape)(ct)[0], None]

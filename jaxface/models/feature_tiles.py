@@ -54,7 +54,7 @@ def tiling(
     pixel = 2 ** (len(blocks) - 1)
     if tile < 1 or tile % pixel:
         raise ValueError(
-            f"tile is {tile}; needed is a positive multiple of {pixel}, one pixel of {blocks[-1][0]}"
+            f"tile is {tile}; needed is a positive multiple of {pixel}, a pixel of {blocks[-1][0]}"
         )
     halos = [0] * len(blocks)
     inner = 0
@@ -86,9 +86,9 @@ def sum_over_tiles(
     Raises:
         ValueError: as ``tiling`` and ``features`` do.
     """
-    plan = tiling(network, image.shape, layers, tile)
-    halo = plan.halos[0]
     height, width = image.shape
+    plan = tiling(network, (height, width), layers, tile)
+    halo = plan.halos[0]
     margin = [
         (halo, plan.rows * tile - height + halo),
         (halo, plan.columns * tile - width + halo),
