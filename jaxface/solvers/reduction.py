@@ -23,7 +23,7 @@ from jaxface._types import Array, Float
 SHIFT = 1e-12
 """what is added to the sample's Gram matrix, as a share of its trace"""
 TRUSTED = 1e4
-"""the factor from the sample serves while it makes no combination of columns longer than its root"""
+"""the sample's factor serves while it makes no combination longer than the root of this"""
 
 
 def triangular_factor(
@@ -58,9 +58,10 @@ def triangular_factor(
 
 def _gram(blocks: Iterable[np.ndarray], columns: int, factor: np.ndarray | None) -> np.ndarray:
     total = np.zeros((columns, columns))
+    divide = scipy.linalg.get_blas_funcs("trsm", dtype=np.float64)
     for block in blocks:
         if factor is not None:  # rows of M S^-1, transposed
-            block = scipy.linalg.blas.dtrsm(1.0, factor, block.T, side=1, overwrite_b=1).T
+            block = divide(1.0, factor, block.T, side=1, overwrite_b=1).T
         total += block @ block.T
     if not np.all(np.isfinite(total)):
         raise ValueError("the columns hold NaN or infinite entries; they must be finite")
@@ -99,17 +100,19 @@ def reduced(
     if size <= count + 1:
         return columns, target
     eye = jnp.eye(count, dtype=columns.dtype)
-    gram = columns @ columns.T
-    # Shifted by what rounding can make of the smallest eigenvalue.
-    tiny = jnp.finfo(columns.dtype).tiny
-    rough = jnp.linalg.cholesky(gram + (1e2 * SHIFT * jnp.trace(gram) + tiny) * eye)
-    even = jax.lax.linalg.triangular_solve(rough, columns, left_side=True, lower=True)
+    even, factor = columns, eye
+    for share in (1e2 * SHIFT, SHIFT):  # the second finds what the first hid
+        gram = even @ even.T
+        tiny = jnp.finfo(columns.dtype).tiny
+        lower = jnp.linalg.cholesky(gram + (share * jnp.trace(gram) + tiny) * eye)
+        even = jax.lax.linalg.triangular_solve(lower, even, left_side=True, lower=True)
+        factor = factor @ lower
     values, vectors = jnp.linalg.eigh(even @ even.T)
-    # Directions without rank carry nothing.
-    usable = values > 1e-14 * values[-1]
+    # What two shifts leave small is rounding, of columns without full rank.
+    usable = values > 1e-6 * values[-1]
     roots = jnp.sqrt(jnp.where(usable, values, 0.0))
     basis = jnp.where(usable, 1.0 / jnp.where(usable, roots, 1.0), 0.0)[:, None] * vectors.T
-    short = rough @ (vectors * roots)
+    short = factor @ (vectors * roots)
     inside = basis @ (even @ target)
     rest = target - (basis.T @ inside) @ even
     more = basis @ (even @ rest)  # a second sweep of Gram-Schmidt

@@ -14,12 +14,13 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.core import Tracer
 
 from jaxface._types import Array, Float
-from jaxface.solvers.simplex_certificate import Certificate, certify
+from jaxface.solvers.simplex_certificate import residuals
 from jaxface.solvers.simplex_implicit import with_derivative
 from jaxface.solvers.simplex_projected_gradient import projected_gradient
-from jaxface.solvers.simplex_working_set import Found, all_points, started, working_set
+from jaxface.solvers.simplex_working_set import Found, working_set
 from jaxface.solvers.solution import Solution
 
 Norm = Literal["frobenius", "squared"]
@@ -145,7 +146,7 @@ def solve(
             weights = jnp.maximum(_double(start), 0.0)
             weights = weights / jnp.sum(weights)
         data = (_double(points), _double(target), weights, jnp.asarray(tolerance, jnp.float64))
-        traced = any(isinstance(x, jax.core.Tracer) for x in data)
+        traced = any(isinstance(x, Tracer) for x in data)
         run = _sequential(norm, method, dtype) if traced else partial(_run, norm, method, dtype)
         return run(*data)
 
@@ -164,11 +165,11 @@ def _run(
     if method == "working_set":
         found = working_set(points, weights, tolerance, floor)
     elif method == "interior_point":
-        found = all_points(points, started(points, weights, tolerance, floor), tolerance, floor)
+        found = working_set(points, weights, tolerance, floor, sets=())
     else:
         squared = norm == "squared"
         found = projected_gradient(points, weights, tolerance, floor, squared=squared)
-    return _rounded(points, scale, target, found, norm=norm, dtype=dtype)
+    return _rounded(points, scale, target, found, tolerance, norm=norm, dtype=dtype)
 
 
 @lru_cache
@@ -189,18 +190,26 @@ def _scaled(points: Array, target: Array, *, norm: Norm) -> tuple[Array, Array]:
 
 @partial(jax.jit, static_argnames=("norm", "dtype"))
 def _rounded(
-    points: Array, scale: Array, target: Array, found: Found, *, norm: Norm, dtype: str
+    points: Array,
+    scale: Array,
+    target: Array,
+    found: Found,
+    tolerance: Array,
+    *,
+    norm: Norm,
+    dtype: str,
 ) -> Answer:
     """The certificate of the weights as they are after rounding to ``dtype``."""
     single = dtype != "float64"
-    weights = jax.lax.reduce_precision(found.weights, 8, 23) if single else found.weights
-    best: Certificate = certify(points, weights / jnp.sum(weights), found.certificate.dual)
-    bound = jnp.maximum(best.bound, found.certificate.bound)
-    objective, bound, norms = best.objective * scale, bound * scale, best.norms * scale
+    weights = _sparse(points, found, tolerance)
+    if single:
+        weights = jax.lax.reduce_precision(weights, 8, 23)
+    r = residuals(points, weights / jnp.sum(weights))
+    objective = jnp.sum(jnp.linalg.norm(r, axis=-1)) * scale
+    norms = jnp.linalg.norm(r.reshape(target.shape), axis=-1) * scale
+    bound = found.certificate.bound * scale
     dual = found.certificate.dual.reshape(target.shape)
     if norm == "squared":
-        r = jnp.tensordot(weights / jnp.sum(weights), points, 1).reshape(target.shape)
-        norms = jnp.linalg.norm(r, axis=-1) * scale
         gap = (objective - bound) * (objective + bound)
         objective, bound, scale = objective**2, bound**2, scale**2
     else:
@@ -221,6 +230,18 @@ def _rounded(
     }
     counts = {name: jnp.asarray(getattr(answer, name), jnp.int32) for name in ("rounds", "steps")}
     return answer._replace(**narrow, **counts)
+
+
+def _sparse(points: Array, found: Found, tolerance: Array) -> Array:
+    """The weights without what the objective does not miss: the fewest that serve."""
+    best = found.weights
+    for share in (1e-8, 1e-6, 1e-4):
+        fewer = jnp.where(found.weights > share * jnp.max(found.weights), found.weights, 0.0)
+        fewer = fewer / jnp.sum(fewer)
+        objective = jnp.sum(jnp.linalg.norm(residuals(points, fewer), axis=-1))
+        limit = found.certificate.objective * (1.0 + 0.1 * tolerance)
+        best = jnp.where(objective <= limit, fewer, best)
+    return best
 
 
 def _double(x: Any) -> Array:

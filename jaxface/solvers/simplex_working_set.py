@@ -6,15 +6,18 @@ Hohenbalken, "Simplicial decomposition in nonlinear programming algorithms", 197
 support outgrows the set, a larger one takes over, at last all points.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from jaxface._types import Array, Bool, Float, Int
 from jaxface.solvers.simplex_certificate import Certificate, certify
 from jaxface.solvers.simplex_interior_point import interior_point
+from jaxface.solvers.simplex_polish import polish
 
 SETS = (64, 256)
 """sizes of the working set that are tried in turn, before all points"""
@@ -117,11 +120,24 @@ def working_set(
                 return all_points(points, found, tolerance, floor)
             return exchange(points, found, tolerance, floor, size=size, rounds=rounds)
 
-        if isinstance(found.converged, jax.core.Tracer):
-            found = jax.lax.cond(found.converged, lambda f: f, attempt, found)
-        elif not found.converged:  # compiles only what is needed
-            found = attempt(found)
+        found = unless_converged(attempt, found)
+        found = unless_converged(lambda f: polished(points, f, tolerance, floor), found)
     return found
+
+
+def unless_converged(function: Callable[[Found], Found], found: Found) -> Found:
+    """``function(found)`` if there is need; where that is known, nothing else is compiled."""
+    if isinstance(found.converged, Tracer):
+        return jax.lax.cond(found.converged, lambda f: f, function, found)
+    return found if found.converged else function(found)
+
+
+@jax.jit
+def polished(points: Array, found: Found, tolerance: Array, floor: Array) -> Found:
+    """Newton steps on the face that was found, kept as far as they help."""
+    weights, dual = polish(points, found.weights, found.certificate.dual)
+    found, _ = improved(found, cleaned(weights), dual, points)
+    return found._replace(converged=closed(found.certificate, tolerance, floor))
 
 
 @partial(jax.jit, static_argnames=("size", "rounds"))

@@ -1,4 +1,4 @@
-"""Blend the feature statistics of a database's faces into those of a photo (Saito 2017, section 4)."""
+"""Feature statistics of a photo as a blend of a database's (Saito 2017, section 4)."""
 
 from jaxface.stages.blend.baselines import nearest_subject, unconstrained
 from jaxface.stages.blend.mixing import blended_grams

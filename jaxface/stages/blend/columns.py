@@ -22,12 +22,12 @@ def half_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def blocks(
-    matrices: tuple[Float[np.ndarray, "k n n"], ...], scale: float, sample: int | None = None
+    matrices: tuple[Any, ...], scale: float, sample: int | None = None
 ) -> Iterator[Float[np.ndarray, "c rows"]]:
     """The matrices' upper halves side by side as columns, a block of rows at a time, as doubles.
 
     Args:
-        matrices: one or several stacks, e.g. a database and its targets; may be memory-mapped.
+        matrices: stacks (k, n, n), e.g. a database and its targets; may be memory-mapped.
         scale: factor on everything.
         sample: only about so many rows, evenly spread and scaled to stand for all of them.
     """
@@ -106,7 +106,7 @@ def check_target(
     return stacks
 
 
-def check_layer_weights(weights: Mapping[str, float] | None, layers: tuple[str, ...]) -> None:
+def check_layer_weights(weights: Mapping[str, Any] | None, layers: tuple[str, ...]) -> None:
     """Raises ValueError unless the layers' factors are positive and of layers there are."""
     for name, value in (weights or {}).items():
         if name not in layers:

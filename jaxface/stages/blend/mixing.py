@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxface._types import Array, Float
 
@@ -15,7 +15,7 @@ BLOCK_BYTES = 64 << 20
 
 def blended_grams(
     database: Mapping[str, Float[Array, "k n n"]], weights: Float[Array, " k"]
-) -> dict[str, Float[Array, "n n"]]:
+) -> dict[str, Any]:
     """``G_l = sum_k w_k G_kl``: with the weights of a blend, those of the complete texture.
 
     A memory-mapped database is read where a weight is not zero, 64 MB at a time, and summed in
@@ -31,7 +31,7 @@ def blended_grams(
                 f"weights has shape {np.shape(weights)}; layer {name!r} of the database has "
                 f"{np.shape(grams)[0]} subjects"
             )
-    traced = [x for x in (weights, *database.values()) if isinstance(x, jax.core.Tracer)]
+    traced = [x for x in (weights, *database.values()) if isinstance(x, Tracer)]
     if traced:
         return {name: jnp.tensordot(weights, grams, 1) for name, grams in database.items()}
     return {name: mixed(grams, np.asarray(weights)) for name, grams in database.items()}
@@ -50,7 +50,7 @@ def mixed(grams: Any, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 
 
 
 def layer_residuals(
-    database: Mapping[str, Any], target: Mapping[str, Any], weights: Float[np.ndarray, "t k"]
+    database: Mapping[str, Any], target: Mapping[str, Any], weights: Any
 ) -> dict[str, Float[np.ndarray, " t"]]:
     """Frobenius norms of the differences between blends and targets, by layer.
 

@@ -99,7 +99,11 @@ def blend(
         fields = {name: value[0] for name, value in fields.items()}
         residuals = {name: value[0] for name, value in residuals.items()}
     return Blend(
-        *(fields[n] for n in ("weights", "objective", "lower_bound", "gap", "relative_gap")),
+        fields["weights"],
+        fields["objective"],
+        fields["lower_bound"],
+        fields["gap"],
+        fields["relative_gap"],
         residuals,
         {name: fields[name] for name in ("rounds", "steps", "converged", "scale")},
     )

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from jaxface._types import Array, Float
 from jaxface.solvers.reduction import reduced
@@ -48,7 +49,7 @@ def blend_weights(
     layers, _ = check_database(database)
     if set(target) != set(layers):
         raise ValueError(f"the target has layers {sorted(target)}, the database {sorted(layers)}")
-    traced = {k: v for k, v in (weights or {}).items() if isinstance(v, jax.core.Tracer)}
+    traced = {k: v for k, v in (weights or {}).items() if isinstance(v, Tracer)}
     known = {k: v for k, v in (weights or {}).items() if k not in traced}
     check_layer_weights(known, layers)
     columns, goals = [], []
