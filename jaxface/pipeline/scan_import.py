@@ -117,7 +117,8 @@ def register_scan(
     found: Registration = non_rigid_icp(
         start[used], kept, placed, scan.faces, landmarks=own[whole],
         landmark_targets=targets[whole], stiffness=_STIFFNESS,
-        vertex_weights=np.clip(1 - 1.5 * ears, 0, 1), reach=25.0, max_angle=50.0, on_progress=on_progress,
+        vertex_weights=np.clip(1 - 1.5 * ears, 0, 1), reach=25.0, max_angle=50.0,
+        on_progress=on_progress,
     )  # fmt: skip
     vertices = np.full((model.vertex_count, 3), np.nan)
     vertices[used] = found.vertices

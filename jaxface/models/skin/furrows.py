@@ -10,12 +10,12 @@ from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
 from jaxface.models.skin.rows import Row, dot
 
-CELLS = (1.25, 0.7)
+CELLS = (1.35, 0.8)
 """size of the cells (mm) of the coarse and of the fine network"""
-STRENGTHS = (0.09, 0.075)
+STRENGTHS = (0.08, 0.025)
 STRETCH = 0.5
 """share by which squared distances along the lines of tension count less"""
-EDGE = 0.3
+EDGE = 0.36
 """half the width of a furrow, in cells"""
 
 
@@ -26,13 +26,13 @@ def furrows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> D
     metric follows the lines of tension. Each cell has a tone of its own.
     """
     r = patch.regions
-    amount = r.skin * (1 - 0.6 * r.nose) * (1 - r.lips) * (0.8 + 0.3 * r.forehead + 0.5 * r.lid)
+    amount = r.skin * (1 - 0.6 * r.nose) * (1 - r.lips) * (0.8 + 0.1 * r.forehead + 0.5 * r.lid)
     depth = jnp.zeros_like(r.skin)
     for layer, (cell, strength) in enumerate(zip(CELLS, STRENGTHS, strict=True)):
         near, next_near, tone = _two_nearest(patch, cell, layer_seed(seed, 20 + layer))
         edge = jnp.clip(1.0 - (next_near - near) / EDGE, 0.0, 1.0)
         shown = visible(cell * 1.3, patch.texel)
-        depth = depth + strength * shown * (edge * edge - 0.14 + 0.35 * (tone - 0.5))
+        depth = depth + strength * shown * (edge * edge - 0.17 + 0.35 * (tone - 0.5))
     depth = depth * amount * traits.furrows
     return Density(0.3 * depth, 0.45 * depth, 0.25 * depth)
 

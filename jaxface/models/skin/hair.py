@@ -65,8 +65,8 @@ def _strokes(
 def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of the beard: strokes, and the blue-grey of the roots under the skin."""
     patchy = gradient_noise(patch.position, 12.0, layer_seed(seed, 50))
-    lean = 0.35 * gradient_noise(patch.position, 12.0, layer_seed(seed, 51))
-    where = jnp.clip(patch.regions.beard * (1.15 + 0.2 * patchy) - 0.12, 0.0, 1.0)
+    lean = 0.23 * gradient_noise(patch.position, 12.0, layer_seed(seed, 51))
+    where = jnp.clip(patch.regions.beard * (1.15 + 0.13 * patchy) - 0.12, 0.0, 1.0)
     grown = 0.25 + 0.75 * traits.stubble
     hairs = _strokes(
         patch, patch.hair, STUBBLE_CELL, where * (0.35 + 0.65 * traits.stubble), lean, 1.0,
@@ -90,7 +90,7 @@ def brows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
     flat = tuple(d - height * n for d, n in zip(direction, patch.normal, strict=True))
     inverse = 1.0 / jnp.sqrt(sum(d * d for d in flat) + 1e-6)
     direction = jax.lax.optimization_barrier(tuple(d * inverse for d in flat))
-    where = jnp.clip(1.5 * patch.regions.brow - 0.25, 0.0, 1.0)
+    where = jnp.clip(1.4 * patch.regions.brow - 0.1, 0.0, 1.0)
     hairs = _strokes(
         patch, direction, BROW_CELL, where, jnp.zeros_like(x), 0.9, (1.2, 2.4), 0.12,
         layer_seed(seed, 60), layers=16,
@@ -102,8 +102,8 @@ def brows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
 def scalp_roots(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of shorn hair on the scalp."""
     patchy = gradient_noise(patch.position, 9.0, layer_seed(seed, 80))
-    where = jnp.clip(patch.regions.scalp * (1.1 + 0.1 * patchy) - 0.1, 0.0, 1.0)
-    lean = 0.6 * gradient_noise(patch.position, 25.0, layer_seed(seed, 81))
+    where = jnp.clip(patch.regions.scalp * (1.1 + 0.07 * patchy) - 0.1, 0.0, 1.0)
+    lean = 0.4 * gradient_noise(patch.position, 25.0, layer_seed(seed, 81))
     hairs = _strokes(
         patch, patch.hair, SCALP_CELL, where, lean, 0.8, (0.2, 0.5), HALF_WIDTH,
         layer_seed(seed, 82), layers=2,
@@ -116,9 +116,9 @@ def down(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Dens
     """Density (negative: paler) of the fine down of cheeks, temples and forehead."""
     r = patch.regions
     where = r.skin * (1 - r.lips) * (1 - 0.7 * r.nose) * (1 - r.scalp)
-    lean = 0.7 * gradient_noise(patch.position, 20.0, layer_seed(seed, 90))
+    lean = 0.45 * gradient_noise(patch.position, 20.0, layer_seed(seed, 90))
     hairs = _strokes(
-        patch, patch.hair, DOWN_CELL, where, lean, 0.7, (0.3, 0.65), 0.13, layer_seed(seed, 91)
+        patch, patch.hair, DOWN_CELL, where, lean, 0.7, (0.3, 0.65), 0.17, layer_seed(seed, 91)
     )
-    pale = 0.08 * traits.furrows * hairs
+    pale = 0.05 * traits.furrows * hairs
     return Density(-0.5 * pale, -0.5 * pale)

@@ -16,9 +16,9 @@ def freckles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> 
     r = patch.regions
     sun = r.skin * (1 - r.lips) * (1 - r.scalp) * (1 - 0.8 * r.lid) * (1 - r.neck)
     sun = sun * jnp.clip(0.25 + r.cheek + r.nose + 0.45 * r.forehead, 0.0, 1.2) * (1 - 0.5 * r.chin)
-    ragged = 0.16 * gradient_noise(patch.position, 1.0, layer_seed(seed, 30))
+    ragged = 0.10 * gradient_noise(patch.position, 1.0, layer_seed(seed, 30))
     cluster = gradient_noise(patch.position, 16.0, layer_seed(seed, 31))
-    chance = traits.freckles * (0.75 + 0.3 * cluster) * sun
+    chance = traits.freckles * (0.75 + 0.2 * cluster) * sun
 
     def spots(cell: float, size: float, layer: int) -> Row:
         def shade(spot: Spot) -> Row:
@@ -37,7 +37,7 @@ def marks(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
     """Density of moles (few, dark), age spots (broad, faint) and blemishes (red)."""
     r = patch.regions
     bare = r.skin * (1 - r.lips) * (1 - r.scalp)
-    ragged = 0.12 * gradient_noise(patch.position, 2.0, layer_seed(seed, 40))
+    ragged = 0.08 * gradient_noise(patch.position, 2.0, layer_seed(seed, 40))
 
     def spots(
         layer: int, cell: float, chance: Row | Array, size: tuple[float, float], soft: float

@@ -11,9 +11,9 @@ from jaxface.models.skin.rows import smoothstep
 
 WAVES = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.55)
 """mm"""
-BLOOD = (0.034, 0.028, 0.024, 0.024, 0.020, 0.012, 0.008)
+BLOOD = (0.028, 0.022, 0.017, 0.014, 0.014, 0.006, 0.002)
 """standard deviation of the density of each wave"""
-MELANIN = (0.026, 0.020, 0.018, 0.018, 0.016, 0.010, 0.007)
+MELANIN = (0.016, 0.012, 0.010, 0.010, 0.012, 0.005, 0.002)
 
 
 def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
@@ -21,7 +21,7 @@ def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> 
     blood = spectrum_noise(patch.position, WAVES, BLOOD, patch.texel, layer_seed(seed, 1))
     melanin = spectrum_noise(patch.position, WAVES, MELANIN, patch.texel, layer_seed(seed, 2))
     r = patch.regions
-    vivid = traits.mottling * (1.0 + 0.4 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.2 * r.forehead)
+    vivid = traits.mottling * (1.0 + 0.4 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.35 * r.forehead)
     return Density(traits.mottling * melanin, vivid * blood)
 
 
@@ -32,8 +32,9 @@ def regional_tone(patch: SkinPatch, traits: SkinAttributes) -> Density:
     tired = 0.5 + 0.5 * jnp.clip((traits.age - 20.0) / 50.0, 0.0, 1.0)
     blood = traits.haemoglobin + traits.flush * flush + 0.07 * tired * r.under_eye - 0.04 * r.lid
     dark = jnp.clip(traits.melanin, 0.0, 1.5)
-    melanin = traits.melanin * (1.0 - 0.35 * r.lips) + r.under_eye * tired * (0.05 + 0.06 * dark)
+    melanin = traits.melanin * (1.0 - 0.12 * r.lips) + r.under_eye * tired * (0.05 + 0.06 * dark)
     melanin = melanin + 0.04 * r.forehead * dark
+    blood = blood + 0.05 * dark * r.lips
     return Density(melanin, blood, 0.03 * tired * r.under_eye)
 
 
@@ -46,9 +47,9 @@ def veins(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
     where = jnp.clip(0.9 * r.nose + 0.8 * r.cheek - 0.15, 0.0, 1.0)
     amount = where * jnp.clip((traits.age - 25.0) / 45.0, 0.1, 1.0) * traits.flush
     branches = jnp.zeros_like(where)
-    for layer, (wave, width) in enumerate(((5.0, 0.16), (2.6, 0.12))):
+    for layer, (wave, width) in enumerate(((5.0, 0.25), (2.6, 0.19))):
         line = jnp.abs(gradient_noise(patch.position, wave, layer_seed(seed, 3 + layer)))
-        wide = width + 0.7 * patch.texel / wave * 4
+        wide = width + 4.4 * patch.texel / wave
         branches = branches + jnp.square(jnp.clip(1.0 - line / wide, 0.0, 1.0)) * width / wide
-    broken = smoothstep(gradient_noise(patch.position, 4.0, layer_seed(seed, 5)), 0.1, 1.2)
+    broken = smoothstep(gradient_noise(patch.position, 4.0, layer_seed(seed, 5)), 0.15, 1.85)
     return Density(0.0, 0.16 * amount * broken * branches)

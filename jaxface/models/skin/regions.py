@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_neighbours, vertex_normals
+from jaxface.imaging.colour import LUMINANCE
 from jaxface.models.morphable import MorphableModel
 
 NOT_SKIN = ("eyes", "mouth_interior")
@@ -127,7 +128,8 @@ def _regions(
         position, _polyline(np.concatenate([marks[54:60], marks[[48]]]) + [0, -7, 0]), 9.0
     )
     beard = np.maximum.reduce([beard * throat, moustache, 0.8 * around]) * (1 - lips) * front
-    brow = np.maximum(*(_near(position, _polyline(marks[a : a + 5]), 3.5) for a in (17, 22)))
+    brow = np.maximum(*(_near(position, _polyline(marks[a : a + 5]), 4.5) for a in (17, 22)))
+    brow = _where_dark(np.asarray(model.albedo_mean, np.float64), brow, forehead)
     out = {
         "skin": skin,
         "nose": nose,
@@ -147,6 +149,16 @@ def _regions(
         name: np.clip(weight * skin if name != "skin" else weight, 0, 1)
         for name, weight in out.items()
     }
+
+
+def _where_dark(albedo: np.ndarray, window: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """The part of a window that a model paints darker than its surroundings, if it does."""
+    luma = albedo @ LUMINANCE
+    darkness = 1 - luma * around.sum() / max(around @ luma, 1e-9)
+    deepest = np.max(darkness * (window > 0.5), initial=0.0)
+    if deepest < 0.15:
+        return window
+    return np.sqrt(window) * _step(darkness / deepest, 0.1, 0.8)
 
 
 def _tension(position: np.ndarray, marks: np.ndarray) -> np.ndarray:

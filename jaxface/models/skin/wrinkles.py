@@ -31,9 +31,9 @@ class _Bends(NamedTuple):
 
 def wrinkles(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of all wrinkles."""
-    bend = 1.4 * gradient_noise(patch.position, 26.0, layer_seed(seed, 100))
-    bend = bend + 0.22 * gradient_noise(patch.position, 8.0, layer_seed(seed, 101))
-    broken = 0.65 + 0.45 * gradient_noise(patch.position, 14.0, layer_seed(seed, 102))
+    bend = 0.9 * gradient_noise(patch.position, 26.0, layer_seed(seed, 100))
+    bend = bend + 0.14 * gradient_noise(patch.position, 8.0, layer_seed(seed, 101))
+    broken = 0.65 + 0.3 * gradient_noise(patch.position, 14.0, layer_seed(seed, 102))
     bends = _Bends(bend, jnp.clip(broken, 0.1, 1.3))
     # Loops, for one line is compiled then, and none is computed once for every pigment.
     lined = jax.lax.fori_loop(
