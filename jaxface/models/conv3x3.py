@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.extend.core
 import jax.numpy as jnp
-from jax import lax
+from jax import core, lax
 from jax.interpreters import ad, batching, mlir
 
 from jaxface._types import Array, Float
@@ -89,7 +89,7 @@ def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array
 
     def shape(x: Any, kernel: Any, _: Any, *, transpose: bool = False, **how: Any) -> Any:
         channels = kernel.shape[2 if transpose else 3]
-        return jax.core.ShapedArray((*x.shape[:-1], channels), x.dtype)
+        return core.ShapedArray((*x.shape[:-1], channels), x.dtype)
 
     def batched(args: Any, dims: Any, **how: Any) -> Any:
         size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
