@@ -19,7 +19,8 @@ from jaxface.io.models import load_model
 from jaxface.models.subdivide import subdivide
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import ambient_light
-from jaxface.stages.unwrap import complete_preview, unwrap
+from jaxface.stages.low_frequency import low_frequency_albedo
+from jaxface.stages.unwrap import unwrap
 
 SIZE = 1024
 DISTANCE = 700.0
@@ -96,9 +97,9 @@ def main() -> None:
             values=lambda r: {"covered": float(jnp.mean(r.visible))},
         )
         bench.time(
-            f"preview {resolution} px",
-            complete_preview,
-            *(result, model.albedo_mean, model.faces, layout),
+            f"low frequencies {resolution} px",
+            low_frequency_albedo,
+            *(result.albedo, result.weight, model.albedo_mean, model.faces, layout),
         )
         time_eos(bench, model, vertices, camera, photo, resolution)
     bench.finish()

@@ -14,7 +14,8 @@ from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.render.interpolate import interpolate
 from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import irradiance
-from jaxface.stages.unwrap import complete_preview, unwrap
+from jaxface.stages.low_frequency import low_frequency_albedo, over_low_frequency
+from jaxface.stages.unwrap import unwrap
 
 SIZE = 200  # px of the photo
 TEXELS = 160
@@ -271,7 +272,10 @@ def test_preview_keeps_what_is_known_and_matches_colours_elsewhere(scene):
     faces = jnp.asarray(scene.faces)
     # A low-frequency albedo of the right colours but half as bright.
     model = 0.5 * jnp.ones((len(scene.vertices), 3)) * jnp.array([0.5, 0.5, 0.45])
-    preview = np.asarray(complete_preview(result, model, faces, scene.layout, cells=16))
+    low = low_frequency_albedo(
+        result.albedo, result.weight, model, faces, scene.layout, cells=16
+    )
+    preview = np.asarray(over_low_frequency(result.albedo, result.weight, low))
     sure = np.asarray(result.weight) == 1
     np.testing.assert_allclose(preview[sure], np.asarray(result.albedo)[sure], atol=1e-6)
     unknown = (np.asarray(result.weight) == 0) & np.asarray(scene.layout.inside)

@@ -25,6 +25,7 @@ from PIL import Image
 
 from jaxface._types import Float
 from jaxface.io.atomic import atomic_path
+from jaxface.io.cache import cache_dir
 from jaxface.io.exr import srgb_encoded
 from jaxface.io.image import write_png
 from jaxface.models.morphable import MorphableModel
@@ -287,3 +288,13 @@ def uv_digest(model: MorphableModel) -> str:
     uv = np.round(np.asarray(model.uv, np.float64) * 2**20).astype("<i8")
     faces = np.asarray(model.uv_faces).astype("<i8")
     return hashlib.blake2b(uv.tobytes() + faces.tobytes(), digest_size=16).hexdigest()
+
+
+def databases_dir() -> Path:
+    """Folder of the databases that are made on demand."""
+    return cache_dir() / "databases"
+
+
+def cached_databases() -> list[Path]:
+    """Databases in `databases_dir`."""
+    return sorted(path.parent for path in databases_dir().glob(f"*/{INDEX}"))

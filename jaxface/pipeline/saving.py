@@ -59,7 +59,7 @@ def save_fit(
     if textured is not None:
         clock.host("write textures", _write_textures, folder, textured)
     clock.host("write meshes", _write_meshes, folder, fitted, textured)
-    clock.host("write fit", _write_arrays, folder, fitted)
+    clock.host("write fit", _write_arrays, folder, fitted, textured)
     clock.host("draw overlay", _write_overlay, folder, fitted, title)
     return write_report(folder, report(fitted, folder, title))[0]
 
@@ -116,7 +116,7 @@ def _write_meshes(folder: Path, fitted: FittedFace, textured: Texture | None) ->
     )
 
 
-def _write_arrays(folder: Path, fitted: FittedFace) -> None:
+def _write_arrays(folder: Path, fitted: FittedFace, textured: Texture | None) -> None:
     data, crop = fitted.working.data, fitted.working.crop
     y = fitted.parameters
     camera = y.camera(data.principal, crop.side)
@@ -134,6 +134,8 @@ def _write_arrays(folder: Path, fitted: FittedFace) -> None:
         "vertex_deviation_mm": np.asarray(fitted.posterior.vertex_deviation, np.float32),
         "vertices_mm": np.asarray(fitted.vertices, np.float32),
     }
+    if textured is not None:
+        arrays["texels_per_pixel"] = np.asarray(textured.texels_per_pixel)
     metadata = {
         "model": fitted.model.name,
         "licence": fitted.model.licence,

@@ -26,7 +26,11 @@ from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.skin.regions import skin_fields
 from jaxface.pipeline.embedding import embed_landmarks
 from jaxface.pipeline.texture_import import whole_texture
-from jaxface.stages.texture_transfer import resample_texture, texel_colours
+from jaxface.stages.texture_transfer import (
+    TransferredTexture,
+    resample_texture,
+    texel_colours,
+)
 
 _HEIGHT = 280.0
 """mm, first guess of a scan's height, for the landmark detector"""
@@ -88,8 +92,7 @@ def register_scan(
         ValueError: the scan has no texture coordinates, or its landmarks cannot be found.
     """
     scan = read_obj(mesh)
-    if scan.uv is None or scan.uv_faces is None:
-        raise ValueError(f"{mesh} has no texture coordinates; a textured scan is needed")
+    _texture_coordinates(scan)
     model = load_model("makehuman") if model is None else model
     if landmarks is not None:
         given = read_landmarks(landmarks)
@@ -133,7 +136,7 @@ def transfer(
     model: MorphableModel,
     layout: UVLayout,
     reach: float = 3.0,
-):
+) -> TransferredTexture:
     """A map of the scan in the model's UVs, by the closest point of the scan to each texel.
 
     Args:
@@ -147,12 +150,12 @@ def transfer(
         A `TransferredTexture`.
     """
     scan = registered.scan
-    assert scan.uv is not None and scan.uv_faces is not None
+    scan_uv, scan_uv_faces = _texture_coordinates(scan)
     at = np.asarray(layout(jnp.asarray(registered.vertices, jnp.float32), model.faces, jnp.nan))
     shown = np.isfinite(at).all(-1)
     tree = TriangleTree(registered.scan_vertices, scan.faces)
     found = tree(at[shown])
-    corners = np.asarray(scan.uv)[scan.uv_faces[found.triangle]]
+    corners = scan_uv[scan_uv_faces[found.triangle]]
     uv = np.einsum("qi,qid->qd", found.weights, corners)
     source_uv = np.full((*shown.shape, 2), np.nan, np.float32)
     source_uv[shown] = np.where(found.distance[:, None] < reach, uv, np.nan)
@@ -209,6 +212,12 @@ def import_scan(
     return database, registered
 
 
+def _texture_coordinates(scan: ObjMesh) -> tuple[np.ndarray, np.ndarray]:
+    if scan.uv is None or scan.uv_faces is None:
+        raise ValueError("the scan has no texture coordinates; a textured OBJ is needed")
+    return np.asarray(scan.uv), scan.uv_faces
+
+
 def _detected(scan: ObjMesh, albedo: str | os.PathLike[str] | None) -> np.ndarray:
     """The 468 points on the scan (its units), found on renders of it."""
     if albedo is None:
@@ -218,10 +227,10 @@ def _detected(scan: ObjMesh, albedo: str | os.PathLike[str] | None) -> np.ndarra
     vertices = scan.vertices
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
     scale = _HEIGHT / np.ptp(vertices[:, 1])
-    assert scan.uv is not None and scan.uv_faces is not None
+    scan_uv, scan_uv_faces = _texture_coordinates(scan)
     corner = np.zeros(len(vertices), np.int64)
-    corner[scan.faces.reshape(-1)] = scan.uv_faces.reshape(-1)
-    colour = srgb_to_linear(texel_colours(small, jnp.asarray(scan.uv[corner], jnp.float32)))
+    corner[scan.faces.reshape(-1)] = scan_uv_faces.reshape(-1)
+    colour = srgb_to_linear(texel_colours(small, jnp.asarray(scan_uv[corner], jnp.float32)))
     count = len(vertices)
     stand_in = MorphableModel(
         mean=jnp.asarray((vertices - middle) * scale, jnp.float32),
@@ -230,8 +239,8 @@ def _detected(scan: ObjMesh, albedo: str | os.PathLike[str] | None) -> np.ndarra
         albedo_mean=colour,
         albedo=LinearBasis(jnp.zeros((count, 3, 0)), jnp.zeros(0)),
         faces=jnp.asarray(scan.faces, jnp.int32),
-        uv=jnp.asarray(scan.uv, jnp.float32),
-        uv_faces=jnp.asarray(scan.uv_faces, jnp.int32),
+        uv=jnp.asarray(scan_uv, jnp.float32),
+        uv_faces=jnp.asarray(scan_uv_faces, jnp.int32),
         landmarks68=None,
         landmarks468=None,
         region=jnp.zeros(count, jnp.int32),

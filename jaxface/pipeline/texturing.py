@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Float
-from jaxface.geometry.uv import uv_layout
+from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.pipeline.fitting import FittedFace
 from jaxface.stages.fit import fit_hidden_shading
-from jaxface.stages.unwrap import PartialAlbedo, complete_preview, unwrap
+from jaxface.stages.low_frequency import low_frequency_albedo, over_low_frequency
+from jaxface.stages.unwrap import PartialAlbedo, unwrap
 
 
 @dataclass(frozen=True)
@@ -19,8 +20,12 @@ class Texture:
     """What the photo shows of the albedo, and a whole texture over the model's own."""
 
     partial: PartialAlbedo
+    low_frequency: Float[Array, "r r 3"]
+    """linear RGB: the model's albedo with the complexion that the photo shows"""
     whole: Float[Array, "r r 3"]
-    """linear RGB, nowhere empty; the model's low-frequency albedo where the photo shows nothing"""
+    """linear RGB, nowhere empty: the partial albedo over the low-frequency one"""
+    texels_per_pixel: float
+    """texels along a side of what one pixel of the photo covers, over what is well seen"""
 
 
 def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
@@ -49,12 +54,29 @@ def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
             fit_hidden_shading(y, model),
         )),
     )  # fmt: skip
-    whole = clock.host(
-        "fill texture", lambda: jax.block_until_ready(
-            complete_preview(partial, model.reflectance(y.albedo), model.faces, layout)
-        ),
+    low = clock.host(
+        "low frequencies", lambda: jax.block_until_ready(low_frequency_albedo(
+            partial.albedo, partial.weight, model.reflectance(y.albedo), model.faces, layout
+        )),
     )  # fmt: skip
-    return Texture(partial, whole)
+    whole = over_low_frequency(partial.albedo, partial.weight, low)
+    return Texture(partial, low, whole, _texels_per_pixel(fitted, partial, layout))
+
+
+def _texels_per_pixel(fitted: FittedFace, partial: PartialAlbedo, layout: UVLayout) -> float:
+    """Root of texels over pixels of the photo, the mean over the texels of full weight."""
+    y, side = fitted.parameters, fitted.working.crop.side
+    camera = y.camera(fitted.working.data.principal, side)
+    corners = np.asarray(camera.project(y.pose(fitted.vertices)))[
+        np.asarray(fitted.model.faces), :2
+    ]
+    edges = corners[:, 1:] - corners[:, :1]
+    pixels = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    triangle = np.asarray(layout.triangle)[np.asarray(partial.weight) > 0.8]
+    triangle = triangle[(triangle >= 0) & (pixels[triangle] > 0)]
+    if not len(triangle):
+        return 1.0
+    return float(np.sqrt(np.mean(np.asarray(layout.area)[triangle] / pixels[triangle])))
 
 
 def _mask_on(shape: tuple[int, int], corner: np.ndarray, crop: Any, fitted: FittedFace):

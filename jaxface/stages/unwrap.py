@@ -18,7 +18,6 @@ from jaxface.geometry.mesh import face_areas_normals, vertex_normals
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.masks import feather, smoothstep
 from jaxface.imaging.mipmap import mipmap
-from jaxface.imaging.push_pull import push_pull
 from jaxface.render.depth_buffer import depth_buffer
 from jaxface.render.shading import irradiance, sh_basis
 
@@ -243,53 +242,6 @@ def _by_tiles(texels, layout: UVLayout, alive: Array, tile: int, dtype) -> Parti
     return PartialAlbedo(
         *(x.reshape(count * tile, count * tile, *x.shape[3:])[:size, :size] for x in maps)
     )
-
-
-@partial(jax.jit, static_argnames=("cells",))
-def complete_preview(
-    partial_albedo: PartialAlbedo,
-    low_frequency: Float[Array, "n 3"],
-    faces: Int[Array, "f 3"],
-    layout: UVLayout,
-    *,
-    cells: int = 64,
-) -> Float[Array, "r r 3"]:
-    """A whole texture to look at: the partial albedo over the model's low-frequency one.
-
-    Where the photo shows nothing, the low-frequency albedo of the fit stands in, multiplied by
-    a smooth gain that makes the two agree where they meet. It holds no detail there: the
-    synthesis of Saito 2017 (section 5) is what replaces it.
-
-    Args:
-        partial_albedo: from ``unwrap`` through the same layout.
-        low_frequency: albedo of each vertex, ``MorphableModel.reflectance``, linear RGB.
-        faces: triangles of the vertices.
-        layout: the texture's layout.
-        cells: cells along a side of the texture in which the gain is measured.
-
-    Returns:
-        Linear RGB, the mean albedo in the empty space between the charts.
-    """
-    weight = partial_albedo.weight[..., None]
-    base = layout(low_frequency, faces)
-    size = layout.resolution
-    cell = -(-size // cells)
-    extra = cell * cells - size
-
-    def cell_sums(x: Array) -> Array:
-        padded = jnp.pad(x, ((0, extra), (0, extra), (0, 0)))
-        return jnp.sum(padded.reshape(cells, cell, cells, cell, -1), axis=(1, 3))
-
-    known = cell_sums(weight) / cell**2
-    observed, expected = cell_sums(weight * partial_albedo.albedo), cell_sums(weight * base)
-    # A specular or badly lit cell must not carry its colour over half the face.
-    gain = jnp.clip(observed / jnp.maximum(expected, 1e-6), 1 / 3, 3.0)
-    smooth = push_pull(jnp.log(gain), known[..., 0])
-    whole = jax.image.resize(smooth, (cell * cells, cell * cells, 3), "linear")
-    filled = base * jnp.exp(whole[:size, :size])
-    texture = weight * partial_albedo.albedo + (1 - weight) * filled
-    empty = (layout.triangle < 0)[..., None]
-    return jnp.where(empty, jnp.mean(low_frequency, axis=0), texture)
 
 
 def _check(

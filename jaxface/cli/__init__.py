@@ -2,16 +2,15 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from jaxface.cli import textures
+from jaxface.cli.console import bar, console, errors, progress
 from jaxface.io.cache import enable_compilation_cache
 
 app = typer.Typer(
@@ -20,8 +19,9 @@ app = typer.Typer(
 )  # fmt: skip
 model_app = typer.Typer(no_args_is_help=True, help="Morphable models: list, describe, import.")
 app.add_typer(model_app, name="model")
-
-_console = Console(stderr=True)
+app.add_typer(textures.database_app, name="database")
+app.add_typer(textures.features_app, name="features")
+app.command("texture")(textures.texture)
 
 PhotoArgument = Annotated[str, typer.Argument(help="Photo, folder of photos, or `demo`.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write into.")]
@@ -116,9 +116,9 @@ def landmarks(
     """Detect faces and their landmarks: JSON and .pts for each face, and a picture."""
     from jaxface.pipeline.detection import write_detections
 
-    with _errors(), _progress(f"landmarks of {photo}"):
+    with errors(), progress(f"landmarks of {photo}"):
         count = write_detections(photo, out, scheme)
-    _console.print(f"{count} face{'s' * (count != 1)}; wrote [bold]{out}[/bold]")
+    console.print(f"{count} face{'s' * (count != 1)}; wrote [bold]{out}[/bold]")
 
 
 @model_app.command("list")
@@ -128,7 +128,7 @@ def model_list() -> None:
 
     for name in bundled_models():
         print(name)
-    _console.print(
+    console.print(
         "files: .npz (jaxface, FLAME, ICT-FaceKit), .mat (BFM 2009), .h5 (BFM 2017, 2019), "
         ".pkl (FLAME), .bin (Surrey), folder (ICT-FaceKit)"
     )
@@ -142,7 +142,7 @@ def model_info(
     """What a model holds: sizes, modes, landmarks, regions, licence."""
     from jaxface.io.models import describe, load_model
 
-    with _errors():
+    with errors():
         facts = describe(load_model(model))
     if as_json:
         print(json.dumps(facts, indent=2))
@@ -167,17 +167,17 @@ def model_import(
     from jaxface.io.models import describe, load_model
 
     options = {} if points is None else {"landmarks": points}
-    with _errors(), _progress(f"importing {source}"):
+    with errors(), progress(f"importing {source}"):
         model = load_model(source, **options)
         save_model(out, model)
     facts = describe(model)
-    _console.print(
+    console.print(
         f"wrote [bold]{out}[/bold]: {facts['vertices']} vertices, "
         f"{facts['identity_modes']} identity, {facts['expression_modes']} expression and "
         f"{facts['albedo_modes']} albedo modes"
     )
     if not (facts["landmarks68"] or facts["landmarks468"]):
-        _console.print("it has no landmark correspondences yet: jaxface model embed-landmarks")
+        console.print("it has no landmark correspondences yet: jaxface model embed-landmarks")
 
 
 @model_app.command("embed-landmarks")
@@ -188,9 +188,9 @@ def model_embed_landmarks(
     """Find a model's landmark correspondences by rendering it and running the detector."""
     from jaxface.pipeline.embedding import embed_landmarks_of
 
-    with _errors(), _progress(f"landmarks of {source}"):
+    with errors(), progress(f"landmarks of {source}"):
         facts = embed_landmarks_of(source, out)
-    _console.print(
+    console.print(
         f"wrote [bold]{out}[/bold]: found in {facts['views']} views, median spread "
         f"{facts['median_spread_mm']:.2f} mm; check landmarks.png"
     )
@@ -206,7 +206,7 @@ def _fit_options(
     size: int,
     details: str | None,
 ) -> dict[str, Any]:
-    with _errors():
+    with errors():
         options: dict[str, Any] = {
             "model": model,
             "landmarks_file": landmarks,
@@ -237,9 +237,9 @@ def _run(photo: str, out: Path, **options: Any) -> None:
         return
     from jaxface.pipeline import digitize as run
 
-    with _errors(), _progress(f"fitting {photo}"):
+    with errors(), progress(f"fitting {photo}"):
         fitted = run(photo, out, **options)
-    _console.print(
+    console.print(
         f"landmark error {fitted.landmark_error():.1%} of the eye distance; "
         f"open [bold]{out / 'report.html'}[/bold]"
     )
@@ -249,44 +249,20 @@ def _run_folder(folder: Path, out: Path, **options: Any) -> None:
     from jaxface.pipeline import digitize_folder, photos_in
 
     failed = 0
-    with _errors():
+    with errors():
         photos = photos_in(folder)
-        with _bar() as progress:
-            task = progress.add_task("photos", total=len(photos))
+        with bar() as shown:
+            task = shown.add_task("photos", total=len(photos))
             for entry in digitize_folder(photos, out, **options):
-                progress.advance(task)
+                shown.advance(task)
                 if entry.error is not None:
                     failed += 1
-                    _console.print(f"[red]{entry.photo.name}[/red]: {entry.error}")
+                    console.print(f"[red]{entry.photo.name}[/red]: {entry.error}")
                 elif entry.fitted is None:
-                    _console.print(f"{entry.photo.name}: done before")
-    _console.print(f"{len(photos) - failed} of {len(photos)} photos in [bold]{out}[/bold]")
+                    console.print(f"{entry.photo.name}: done before")
+    console.print(f"{len(photos) - failed} of {len(photos)} photos in [bold]{out}[/bold]")
     if failed:
         raise typer.Exit(2)
-
-
-def _bar() -> Progress:
-    return Progress(
-        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=_console,
-        transient=True,
-    )  # fmt: skip
-
-
-@contextmanager
-def _progress(text: str) -> Iterator[None]:
-    with _bar() as progress:
-        progress.add_task(text, total=None)
-        yield
-
-
-@contextmanager
-def _errors() -> Iterator[None]:
-    """What a user can mend is told in one line, with exit code 2 and no traceback."""
-    try:
-        yield
-    except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        _console.print(f"[bold red]error:[/bold red] {error}", highlight=False, soft_wrap=True)
-        raise typer.Exit(2) from error
 
 
 def main() -> None:

@@ -1,0 +1,135 @@
+"""Commands of the texture: complete an albedo, and what that needs."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from jaxface.cli.console import console, errors, steps
+
+database_app = typer.Typer(no_args_is_help=True, help="Texture databases: list, make, describe.")
+features_app = typer.Typer(no_args_is_help=True, help="Feature networks of the texture statistics.")
+
+DatabaseOption = Annotated[
+    Path | None,
+    typer.Option("--database", help="Texture database; the procedural skins if not given."),
+]
+FeaturesOption = Annotated[
+    str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")
+]
+IterationsOption = Annotated[
+    int, typer.Option("--iterations", help="Steps of the synthesis over all resolutions.")
+]
+
+
+def texture(
+    out: Annotated[Path, typer.Argument(help="Folder that `jaxface digitize` or `fit` wrote.")],
+    database: DatabaseOption = None,
+    features: FeaturesOption = "random",
+    resolution: Annotated[
+        int | None, typer.Option("--resolution", help="Texels along a side; as the partial albedo.")
+    ] = None,
+    alpha: Annotated[float, typer.Option("--alpha", help="Weight of detail, equation 3.")] = 2000,
+    norm: Annotated[
+        str, typer.Option("--norm", help="Of the blend: frobenius (the paper's) or squared.")
+    ] = "frobenius",
+    iterations: IterationsOption = 1000,
+    detail: Annotated[
+        str | None,
+        typer.Option("--detail", help="Detail by region from 0 to 1, as lips=0.5,nose=1."),
+    ] = None,
+    keep_photo: Annotated[
+        float | None,
+        typer.Option("--keep-photo", help="Weight of what the photo shows; 0 as in the paper."),
+    ] = None,
+    start: Annotated[
+        str, typer.Option("--start", help="neighbour, or low_frequency as in the paper.")
+    ] = "neighbour",
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Model file, where it is not a bundled one.")
+    ] = None,
+) -> None:
+    """Complete the albedo of a digitized photo: analysis, blending, synthesis."""
+    from jaxface.pipeline.completion_files import complete_folder, parse_settings
+
+    with errors(), steps(f"texture of {out}") as on_step:
+        settings = parse_settings(
+            alpha=alpha, norm=norm, iterations=iterations, detail=detail, photo=keep_photo,
+            start=start,
+        )  # fmt: skip
+        done = complete_folder(
+            out, database=database, features=features, resolution=resolution, settings=settings,
+            model=model, on_step=on_step,
+        )  # fmt: skip
+    console.print(
+        f"{(done.blended.weights > 0).sum()} subjects blended, relative gap "
+        f"{float(done.blended.relative_gap):.1e}; wrote [bold]{out / 'albedo.png'}[/bold]"
+    )
+
+
+@database_app.command("list")
+def database_list() -> None:
+    """Databases in the cache."""
+    from jaxface.io.texture_database import cached_databases
+
+    found = cached_databases()
+    for path in found:
+        print(path)
+    if not found:
+        console.print("none yet: `jaxface texture` makes the procedural one when it needs it")
+
+
+@database_app.command("info")
+def database_info(
+    path: Annotated[Path, typer.Argument(help="Folder of a database.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """What a database holds: subjects, licences, size, gaps."""
+    from jaxface.io.texture_database import TextureDatabase
+
+    with errors():
+        facts = TextureDatabase(path).info()
+    if as_json:
+        print(json.dumps(facts, indent=2))
+        return
+    table = Table(show_header=False)
+    for key, value in facts.items():
+        text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        table.add_row(key, text)
+    Console().print(table)
+
+
+@database_app.command("synth")
+def database_synth(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write into.")],
+    subjects: Annotated[int, typer.Option("--subjects", help="How many.")] = 24,
+    resolution: Annotated[int, typer.Option("--resolution", help="Texels along a side.")] = 1024,
+    seed: Annotated[int, typer.Option("--seed", help="Of the population.")] = 0,
+) -> None:
+    """Procedural skins (CC0); goes on where an earlier run stopped."""
+    from jaxface.pipeline.skin_database import synth_database
+
+    with errors(), steps(f"skins in {out}") as on_step:
+        made: Any = synth_database(
+            out, subjects, resolution, seed, lambda done, of: on_step("skins", done, of)
+        )
+    console.print(f"{len(made)} skins in [bold]{out}[/bold]")
+
+
+@features_app.command("info")
+def features_info(
+    source: Annotated[str, typer.Argument(help="random, trained, vgg16, vgg19, or a file.")],
+) -> None:
+    """Layers, channels and licence of a feature network."""
+    from jaxface.io.feature_weights import load_network
+
+    with errors():
+        network = load_network(source)
+    table = Table("layer", "channels", title=f"{network.name}, {network.pooling} pooling")
+    for name, channels in network.channels.items():
+        table.add_row(name, str(channels))
+    Console().print(table)
+    console.print(network.licence)

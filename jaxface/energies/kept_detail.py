@@ -1,0 +1,73 @@
+"""Terms that hold a synthesised texture to what is known: the photo, and the low frequencies.
+
+Saito 2017 names as its limitation (section 7) that a mole may appear anywhere, whether it exists
+or not. Where the photo shows the skin, it says where: up to the frequency that the photo holds.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxface._types import Array, Float
+
+
+class KnownDetail(eqx.Module):
+    """What a texture is held to; every map (h, w), intensities as the texture's."""
+
+    photo: Float[Array, "h w"]
+    """what the photo shows, anything where ``weight`` is 0"""
+    weight: Float[Array, "h w"]
+    """how far the photo is to be trusted, 0 to 1"""
+    low_frequency: Float[Array, "h w"]
+    detail: Float[Array, "h w"]
+    """where detail may go: 1 anywhere, 0 keeps the low frequencies as they are"""
+
+
+def known_detail_energy(
+    image: Float[Array, "h w"],
+    known: KnownDetail,
+    blur: Float[Array, ""] | float,
+    photo_weight: Float[Array, ""] | float = 1.0,
+    plain_weight: Float[Array, ""] | float = 1.0,
+) -> Float[Array, ""]:
+    """``b sum_p w_p (K (I - P))_p^2 + c sum_p (1 - d_p) (I - L)_p^2``.
+
+    K is a Gaussian low-pass: the first term binds the frequencies that the photo holds and leaves
+    those above to synthesis.
+
+    Args:
+        image: Y of the texture.
+        known: photo P with weights w, low frequencies L, detail map d.
+        blur: standard deviation of K, texels; 0 binds every frequency.
+        photo_weight: b.
+        plain_weight: c.
+    """
+    away = known.weight * (image - known.photo)
+    held = jnp.sum(known.weight * low_pass(away, blur) ** 2)
+    plain = jnp.sum((1.0 - known.detail) * (image - known.low_frequency) ** 2)
+    return photo_weight * held + plain_weight * plain
+
+
+def low_pass(image: Float[Array, "h w"], blur: Float[Array, ""] | float) -> Float[Array, "h w"]:
+    """Gaussian blur by a standard deviation that may be traced; zeros beyond the border.
+
+    Two runs along each axis of a box filter would tie the kernel to whole texels; the exact
+    transfer function ``exp(-2 pi^2 f^2 s^2)`` is applied to the padded image's spectrum instead.
+    """
+    height, width = image.shape
+    margin = 16
+    padded = jnp.pad(image, ((0, margin), (0, margin)))
+    spectrum = jnp.fft.rfft2(padded)
+    fy = jnp.fft.fftfreq(height + margin).astype(image.dtype)[:, None]
+    fx = jnp.fft.rfftfreq(width + margin).astype(image.dtype)[None]
+    transfer = jnp.exp(-2 * jnp.pi**2 * (fy**2 + fx**2) * jnp.asarray(blur, image.dtype) ** 2)
+    return jnp.fft.irfft2(spectrum * transfer, padded.shape)[:height, :width].astype(image.dtype)
+
+
+def normalised_low_pass(
+    values: Float[Array, "h w c"], weight: Float[Array, "h w"], blur: Float[Array, ""] | float
+) -> Float[Array, "h w c"]:
+    """Blur where a weight says what counts: ``K(w v) / K(w)`` (Knutsson and Westin 1993)."""
+    total = low_pass(weight, blur)
+    blurred = jax.vmap(lambda v: low_pass(v * weight, blur), -1, -1)(values)
+    return blurred / jnp.maximum(total, 1e-4)[..., None]

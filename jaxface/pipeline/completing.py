@@ -1,0 +1,339 @@
+"""Partial albedo -> complete albedo: analysis, blending, synthesis (Saito 2017, secs. 4 to 6)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Array, Bool, Float
+from jaxface.energies.gram import DETAIL_WEIGHT, STYLE_LAYERS, StyleTargets, grams, mask_out
+from jaxface.energies.kept_detail import KnownDetail
+from jaxface.imaging.colour import rgb_to_yiq
+from jaxface.imaging.push_pull import push_pull
+from jaxface.imaging.resample import resize
+from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.features import FeatureNetwork
+from jaxface.pipeline.seen_texture import SeenTexture
+from jaxface.stages.blend import Blend, blend
+from jaxface.stages.detail import (
+    COMPLEXION,
+    soft_inside,
+    with_complexion,
+    with_intensity,
+    with_photo,
+)
+from jaxface.stages.synthesise import SynthesisProblem, SynthesisWeights, synthesise
+
+COARSEST = 256
+ANALYSIS = 512
+"""greatest resolution at which photo and database are compared"""
+
+PHOTO_BLUR = 0.6
+"""standard deviation of the low-pass that passes what a photo holds, in its pixels"""
+
+LARGEST_WHOLE = 1 << 20
+"""texels up to which statistics are taken in one piece; beyond, in tiles of 1024"""
+
+Progress = Callable[[str, int, int, Callable[[], Float[np.ndarray, "h w 3"]] | None], None]
+"""``(what, done, of, picture)``: a picture of the work so far where there is one"""
+
+
+@dataclass(frozen=True)
+class CompletionSettings:
+    """How a texture is completed; the defaults are those of the command line."""
+
+    alpha: float = DETAIL_WEIGHT
+    """of eq. 3"""
+    norm: str = "frobenius"
+    """of eq. 2: ``frobenius`` (the paper's sum of unsquared norms) or ``squared``"""
+    iterations: int = 1000
+    """L-BFGS steps in all, most of them at the coarse levels"""
+    layers: tuple[str, ...] = STYLE_LAYERS
+    """L_G of eq. 3, and the layers that are compared in eq. 2"""
+    weights: SynthesisWeights = field(default_factory=SynthesisWeights)
+    match_complexion: bool = True
+    """compare and blend the subjects' detail on the photo's complexion; False: as in the paper,
+    where tone counts too"""
+    start: str = "neighbour"
+    """first intensities: ``neighbour`` (detail of the subject of the largest weight) or
+    ``low_frequency`` (the paper's)"""
+    detail: Mapping[str, float] = field(default_factory=dict)
+    """by region of the model: 1 lets detail in, 0 keeps the low frequencies; 1 where not named"""
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A complete albedo and how it came about."""
+
+    albedo: Float[np.ndarray, "r r 3"]
+    """sRGB-encoded"""
+    start: Float[np.ndarray, "r r 3"]
+    """the texture before synthesis, sRGB-encoded"""
+    blended: Blend
+    names: tuple[str, ...]
+    """subjects, in the order of the blend's weights"""
+    analysed_at: int
+    """texels along a side when photo and database were compared"""
+    targets: dict[str, Float[np.ndarray, "n n"]]
+    """Gram matrices that the finest level was to match"""
+    box: tuple[slice, slice]
+    """rows and columns of the synthesised part"""
+    levels: list[dict[str, Any]]
+    """a record for each level: name, values, terms, evaluations"""
+
+
+def complete(
+    seen: SeenTexture,
+    database: TextureDatabase,
+    network: FeatureNetwork,
+    settings: CompletionSettings | None = None,
+    *,
+    on_progress: Progress = lambda what, done, of, picture: None,
+    resumed: Callable[[int], "Level | None"] = lambda level: None,
+    finished: Callable[[int, "Level"], None] = lambda level, done: None,
+) -> Completed:
+    """Complete the albedo of a face from what the photo shows and a database of textures.
+
+    The face's skin is synthesised; scalp, neck and ears get the detail of the database's subject
+    with the largest weight, eyes and mouth stay as they are.
+
+    Args:
+        seen: what the photo shows, at the resolution wanted.
+        database: textures in the same UVs.
+        network: extractor of features.
+        settings: see `CompletionSettings`.
+        on_progress: told of every step.
+        resumed: a level (texels along a side) that an earlier run has finished.
+        finished: told of every finished level.
+
+    Raises:
+        ValueError: the database has fewer than two subjects, or the photo shows no skin.
+    """
+    settings = settings or CompletionSettings()
+    if len(database) < 2:
+        raise ValueError(f"database {database.name!r} has {len(database)} subjects; 2 are needed")
+    work = _Work(seen, database, network, settings, on_progress)
+    blended = work.blend()
+    order = np.argsort(-blended.weights)
+    used = [int(i) for i in order if blended.weights[i] > 1e-3]
+    records: list[dict[str, Any]] = []
+    start, last = np.zeros(0), None
+    for index, level in enumerate(work.levels):
+        start = work.start(level, used[0])
+        done = resumed(level)
+        if done is None or done.image.shape != work.cut(start, level).shape[:2]:
+            coarser = None if last is None else last.image
+            done = work.synthesise(level, start, coarser, blended, used, index)
+            finished(level, done)
+        records.append(done.record)
+        last = done
+    assert last is not None
+    return Completed(
+        work.compose(start, last.image),
+        start,
+        blended,
+        database.names,
+        work.analysis_level,
+        last.targets,
+        work.box(work.levels[-1]),
+        records,
+    )
+
+
+class Level(NamedTuple):
+    """One level of a synthesis, finished.
+
+    Attributes:
+        image: intensities in the box.
+        targets: Gram matrices that it was to match.
+        record: name, values, terms, evaluations.
+    """
+
+    image: Float[np.ndarray, "h w"]
+    targets: dict[str, Float[np.ndarray, "n n"]]
+    record: dict[str, Any]
+
+
+class _Work:
+    """The textures of one completion at every level, made when they are needed."""
+
+    def __init__(
+        self,
+        seen: SeenTexture,
+        database: TextureDatabase,
+        network: FeatureNetwork,
+        settings: CompletionSettings,
+        on_progress: Progress,
+    ) -> None:
+        self.seen, self.database, self.network = seen, database, network
+        self.settings, self.on_progress = settings, on_progress
+        self.levels = [seen.resolution]
+        while self.levels[0] >= 2 * COARSEST and self.levels[0] % 2 == 0:
+            self.levels.insert(0, self.levels[0] // 2)
+        rows, columns = np.nonzero(seen.free)
+        grain = seen.resolution // self.levels[0] * 16
+        low = (np.array([rows.min(), columns.min()]) // grain - 1).clip(0) * grain
+        high = (np.array([rows.max(), columns.max()]) // grain + 2) * grain
+        self._box = low, high.clip(max=seen.resolution)
+        sharp = [r for r in self.levels if r <= ANALYSIS and self._texels(r) <= 1.5]
+        self.analysis_level = max(sharp, default=self.levels[0])
+        tiled = np.prod(self._box[1] - self._box[0]) > LARGEST_WHOLE
+        tile = 1024 if tiled else None
+        self._grams = jax.jit(lambda net, image: grams(net, image, settings.layers, tile))
+        self.tile = tile
+
+    def _texels(self, level: int) -> float:
+        """Texels of a level for one pixel of the photo."""
+        return self.seen.texels_per_pixel * level / self.seen.resolution
+
+    def box(self, level: int) -> tuple[slice, slice]:
+        factor = self.seen.resolution // level
+        (top, left), (bottom, right) = (corner // factor for corner in self._box)
+        return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+    def cut(self, texture: Any, level: int) -> Any:
+        return texture[self.box(level)]
+
+    def mask(self, level: int) -> Bool[np.ndarray, "h w"]:
+        return shrink(self.seen.free[..., None].astype(np.float32), level)[..., 0] > 0.5
+
+    def photo(self, level: int) -> tuple[Array, Array]:
+        """What the photo shows at a level, and how far it is to be trusted there."""
+        weight = shrink(self.seen.weight[..., None], level)
+        colour = shrink(self.seen.photo * self.seen.weight[..., None], level)
+        return jnp.asarray(colour / np.maximum(weight, 1e-3)), jnp.asarray(weight[..., 0])
+
+    def subject(self, index: int, level: int) -> Array:
+        """A subject's texture at a level, on the photo's complexion if the settings say so."""
+        texture = shrink(self.database.encoded(self.database.names[index]), level)
+        low = jnp.asarray(shrink(self.seen.low_frequency, level))
+        if texture.shape[0] < level:
+            texture = resize(jnp.asarray(texture), level, level)
+        if not self.settings.match_complexion:
+            return jnp.asarray(texture)
+        return with_complexion(jnp.asarray(texture), low, level * COMPLEXION)
+
+    def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
+        """Gram matrices of a texture's intensity, masked out beyond a mask, in the box."""
+        shown = mask_out(rgb_to_yiq(texture)[..., 0], jnp.asarray(mask))
+        return self._grams(self.network, self.cut(shown, level))
+
+    def blend(self) -> Blend:
+        """Section 4: compare what the photo shows with the same part of every subject."""
+        level, count = self.analysis_level, len(self.database)
+        photo, weight = self.photo(level)
+        mask = self.mask(level) & (np.asarray(weight) > 0.5)
+        if mask.sum() < 100:
+            raise ValueError("the photo shows next to no skin of the face that could be analysed")
+        target = self.statistics(photo, mask, level)
+        stacks: dict[str, list[np.ndarray]] = {name: [] for name in target}
+        for index in range(count):
+            for name, value in self.statistics(self.subject(index, level), mask, level).items():
+                stacks[name].append(np.asarray(value))
+            self.on_progress("analysis", index + 1, count, None)
+        columns = {name: np.stack(values) for name, values in stacks.items()}
+        goal = {name: np.asarray(value) for name, value in target.items()}
+        return blend(columns, goal, norm=self.settings.norm)  # pyright: ignore[reportArgumentType]
+
+    def targets(self, level: int, blended: Blend, used: list[int]) -> dict[str, Array]:
+        """The complete Gram matrices ``sum_k w_k G(I_k)``."""
+        weights = blended.weights[used] / blended.weights[used].sum()
+        total: dict[str, Array] = {}
+        for share, index in zip(weights, used, strict=True):
+            found = self.statistics(self.subject(index, level), self.mask(level), level)
+            for name, value in found.items():
+                total[name] = share * value + total.get(name, 0.0)
+        return total
+
+    def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
+        """The texture before synthesis: whole, sRGB-encoded."""
+        low = jnp.asarray(shrink(self.seen.low_frequency, level))
+        texture = low
+        if self.settings.start == "neighbour":
+            texture = self.subject(nearest, level)
+        texture = with_photo(texture, *self.photo(level), PHOTO_BLUR * self._texels(level))
+        skin = shrink(self.seen.skin[..., None].astype(np.float32), level)
+        return np.asarray(skin * texture + (1 - skin) * low)
+
+    def synthesise(
+        self,
+        level: int,
+        start: Float[np.ndarray, "r r 3"],
+        coarser: Float[np.ndarray, "h w"] | None,
+        blended: Blend,
+        used: list[int],
+        index: int,
+    ) -> Level:
+        """Section 5 at one level, from the coarser level's result with the start's finer detail."""
+        first = self.cut(rgb_to_yiq(jnp.asarray(start))[..., 0], level)
+        if coarser is not None:
+            lower = resize(first[..., None], *coarser.shape)
+            first = first + resize(jnp.asarray(coarser)[..., None] - lower, *first.shape)[..., 0]
+        free = self.cut(self.mask(level), level)
+        photo, weight = self.photo(level)
+        low = rgb_to_yiq(jnp.asarray(shrink(self.seen.low_frequency, level)))[..., 0]
+        detail = shrink(self.seen.detail_map(self.settings.detail)[..., None], level)[..., 0]
+        known = KnownDetail(
+            self.cut(rgb_to_yiq(photo)[..., 0], level),
+            self.cut(weight, level) * free,
+            self.cut(low, level),
+            jnp.asarray(self.cut(detail, level)),
+        )
+        goal = self.targets(level, blended, used)
+        targets = StyleTargets(goal, alpha=self.settings.alpha)
+        blur = jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype)
+        problem = SynthesisProblem(
+            self.network, targets, jnp.asarray(free), known, blur, self.settings.weights
+        )
+        steps = level_steps(self.settings.iterations, len(self.levels))[index]
+        what = f"synthesis at {level}"
+
+        def on_step(step: int, value: float, image: Callable[[], Array]) -> None:
+            self.on_progress(what, step, steps, lambda: self.compose(start, np.asarray(image())))
+
+        found = synthesise(
+            jnp.clip(first, 0.01, 0.99), problem, steps=steps, tile=self.tile, on_step=on_step
+        )
+        record = {
+            "name": f"{level} px",
+            "values": found.values,
+            "terms": found.terms,
+            "evaluations": found.evaluations,
+        }
+        return Level(
+            np.asarray(found.image), {name: np.asarray(g) for name, g in goal.items()}, record
+        )
+
+    def compose(
+        self, start: Float[np.ndarray, "r r 3"], intensity: Float[np.ndarray, "h w"]
+    ) -> Float[np.ndarray, "r r 3"]:
+        """The synthesised intensity with the start's colour, in the start's surroundings."""
+        level = len(start)
+        box = self.box(level)
+        free = jnp.asarray(self.cut(self.mask(level), level))
+        soft = soft_inside(free, max(level // 128, 2))
+        colour = jnp.asarray(start[box])
+        mixed = soft * intensity + (1 - soft) * rgb_to_yiq(colour)[..., 0]
+        whole = np.array(start)
+        whole[box] = np.asarray(with_intensity(colour, mixed))
+        inside = shrink(self.seen.inside[..., None].astype(np.float32), level)
+        # Between the charts the nearest colours continue, so that a filter finds no dark rim.
+        return np.asarray(push_pull(jnp.asarray(whole), jnp.asarray(inside[..., 0] > 0.99, float)))
+
+
+def level_steps(iterations: int, levels: int) -> list[int]:
+    """Steps at each level, coarsest first: half as many at each finer one, one at least."""
+    shares = 0.5 ** np.arange(levels)
+    return [max(1, round(iterations * share)) for share in shares / shares.sum()]
+
+
+def shrink(texture: Float[np.ndarray, "r r c"], side: int) -> Float[np.ndarray, "s s c"]:
+    """Average over blocks of texels; a texture that is small enough already is left as it is."""
+    factor = max(len(texture) // side, 1)
+    if factor == 1:
+        return np.asarray(texture, np.float32)
+    blocks = np.asarray(texture, np.float32).reshape(side, factor, side, factor, -1)
+    return blocks.mean(axis=(1, 3))

@@ -1,0 +1,361 @@
+"""`jaxface texture`: complete the albedo in a folder that a fit has written, and resume it."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Float
+from jaxface.imaging.colour import srgb_to_linear
+from jaxface.io.atomic import atomic_path
+from jaxface.io.exr import write_exr
+from jaxface.io.feature_weights import load_network
+from jaxface.io.image import write_png
+from jaxface.io.models import load_model
+from jaxface.io.overlay import contact_sheet
+from jaxface.io.report import write_report
+from jaxface.io.retexture import retexture_glb, retexture_obj
+from jaxface.io.texture_database import TextureDatabase, databases_dir
+from jaxface.pipeline.completing import Completed, CompletionSettings, Level, complete, shrink
+from jaxface.pipeline.seen_texture import SeenTexture, read_seen_texture
+from jaxface.pipeline.skin_database import synth_database
+from jaxface.stages.synthesise import SynthesisWeights
+
+SUBJECTS = 24
+"""of the procedural database that is made where none is named"""
+
+LARGEST_DATABASE = 2048
+"""texels of its textures at most; finer maps are synthesised from these"""
+
+PREVIEW_SECONDS = 30.0
+WORK_FOLDER = ".completion"
+
+OnStep = Callable[[str, int, int], None]
+
+_FILES = {
+    "albedo.exr": "complete albedo, UV, linear half float RGB",
+    "albedo.png": "the same, sRGB; the meshes' texture",
+    "blend.json": "weights of the database's subjects, objective, certified gap",
+    "grams.npz": "the Gram matrices that the synthesis was to match",
+    "completion.png": "partial, low frequencies, neighbours, result, close-ups",
+}
+
+
+def complete_folder(
+    folder: str | os.PathLike[str],
+    *,
+    database: str | os.PathLike[str] | None = None,
+    features: str = "random",
+    resolution: int | None = None,
+    settings: CompletionSettings | None = None,
+    model: str | os.PathLike[str] | None = None,
+    on_step: OnStep = lambda what, done, of: None,
+) -> Completed:
+    """Complete the albedo of a digitized photo, and write map, meshes, pictures and report.
+
+    A run that was killed goes on at the level where it stopped, if it is repeated with the same
+    settings.
+
+    Args:
+        folder: written by `save_fit` with textures.
+        database: folder of a texture database; by default a procedural one, made once and kept
+            in the cache.
+        features: name or file of the feature network, see `load_network`.
+        resolution: texels along a side; as the partial albedo has by default.
+        settings: see `CompletionSettings`.
+        model: file of the model, where the fit is not of a bundled one.
+        on_step: told of every step.
+
+    Raises:
+        FileNotFoundError: the folder lacks the fit, or database or weights are nowhere.
+        ValueError: files are damaged or do not fit together.
+    """
+    place, settings = Path(folder), settings or CompletionSettings()
+    started = time.perf_counter()
+    network = load_network(features)
+    seen = read_seen_texture(place, resolution, model)
+    textures = open_database(database, model or seen.model.name, seen.resolution, on_step)
+    work = _Checkpoint(place, settings, network.name, textures, seen)
+    shown = time.perf_counter()
+
+    def on_progress(
+        what: str, done: int, of: int, picture: Callable[[], Float[np.ndarray, "h w 3"]] | None
+    ) -> None:
+        nonlocal shown
+        on_step(what, done, of)
+        if picture is not None and (done == of or time.perf_counter() - shown > PREVIEW_SECONDS):
+            shown = time.perf_counter()
+            write_png(place / "albedo_preview.png", picture())
+
+    done = complete(
+        seen, textures, network, settings,
+        on_progress=on_progress, resumed=work.read, finished=work.write,
+    )  # fmt: skip
+    seconds = time.perf_counter() - started
+    _write(place, done, seen, textures, network.licence, seconds)
+    work.clear()
+    (place / "albedo_preview.png").unlink(missing_ok=True)
+    return done
+
+
+def open_database(
+    path: str | os.PathLike[str] | None,
+    model: str | os.PathLike[str],
+    resolution: int,
+    on_step: OnStep = lambda what, done, of: None,
+) -> TextureDatabase:
+    """The database of a path; without one the procedural one, made where it is not there yet.
+
+    Raises:
+        FileNotFoundError: there is no database.
+        ValueError: it is in the UVs of another model, or there is none for this model.
+    """
+    if path is not None:
+        return TextureDatabase(path, load_model(model))
+    if str(model) != "makehuman":
+        raise ValueError(
+            f"the procedural skins are painted for the model 'makehuman', not for {str(model)!r}; "
+            "name a database in this model's UVs"
+        )
+    size = min(resolution, LARGEST_DATABASE)
+    folder = databases_dir() / f"procedural-{size}"
+    return synth_database(
+        folder, SUBJECTS, size, on_progress=lambda i, n: on_step("procedural skins", i, n)
+    )
+
+
+class _Checkpoint:
+    """Finished levels of one completion, kept until it is whole."""
+
+    def __init__(
+        self,
+        place: Path,
+        settings: CompletionSettings,
+        network: str,
+        textures: TextureDatabase,
+        seen: SeenTexture,
+    ) -> None:
+        facts = [
+            repr(settings), network, textures.names, textures.resolution, seen.resolution,
+            hashlib.sha256(seen.photo.tobytes()).hexdigest(),
+        ]  # fmt: skip
+        self.key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+        self.folder = place / WORK_FOLDER
+
+    def _file(self, level: int) -> Path:
+        return self.folder / f"{self.key}-{level}.npz"
+
+    def read(self, level: int) -> Level | None:
+        """A finished level, or None where there is none, or its file is damaged."""
+        try:
+            with np.load(self._file(level), allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            record = json.loads(str(arrays.pop("record")))
+            return Level(arrays.pop("image"), arrays, record)
+        except (OSError, ValueError, KeyError, EOFError):
+            return None
+
+    def write(self, level: int, done: Level) -> None:
+        """Keep a level."""
+        with atomic_path(self._file(level)) as temporary, open(temporary, "wb") as file:
+            entries: dict[str, Any] = {**done.targets, "image": done.image}
+            np.savez(file, record=np.array(json.dumps(done.record)), **entries)
+
+    def clear(self) -> None:
+        """Everything is written: forget the levels."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _write(
+    place: Path,
+    done: Completed,
+    seen: SeenTexture,
+    textures: TextureDatabase,
+    network_licence: str,
+    seconds: float,
+) -> None:
+    linear = np.asarray(srgb_to_linear(jnp.asarray(done.albedo)))
+    write_exr(place / "albedo.exr", linear, half=True)
+    write_png(place / "albedo.png", done.albedo)
+    with atomic_path(place / "grams.npz") as temporary, open(temporary, "wb") as file:
+        entries: dict[str, Any] = done.targets
+        np.savez_compressed(file, **entries)
+    blended = done.blended
+    order = [int(i) for i in np.argsort(-blended.weights)]
+    weights = [
+        {"subject": done.names[i], "weight": float(blended.weights[i])}
+        for i in order
+        if blended.weights[i] > 0
+    ]
+    facts = {
+        "schema": 1,
+        "database": textures.name,
+        "compared_at": done.analysed_at,
+        "weights": weights,
+        "objective": float(blended.objective),
+        "lower_bound": float(blended.lower_bound),
+        "gap": float(blended.gap),
+        "relative_gap": float(blended.relative_gap),
+        "residuals": {name: float(value) for name, value in blended.residuals.items()},
+    }
+    with atomic_path(place / "blend.json") as temporary:
+        temporary.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_png(place / "completion.png", _sheet(done, seen, textures, order))
+    if (place / "mesh.glb").is_file():
+        retexture_glb(place / "mesh.glb", (place / "albedo.png").read_bytes())
+    if (place / "mesh.mtl").is_file():
+        retexture_obj(place / "mesh.obj", "albedo.png")
+    _extend_report(place, done, textures, network_licence, seconds, weights)
+
+
+def _sheet(
+    done: Completed, seen: SeenTexture, textures: TextureDatabase, order: list[int]
+) -> np.ndarray:
+    box = done.box
+    partial = np.where(seen.weight[..., None] > 0, seen.photo, 0.5)
+    panels = [
+        ("partial albedo", partial[box]),
+        ("low frequencies", seen.low_frequency[box]),
+        ("before synthesis", done.start[box]),
+        ("complete albedo", done.albedo[box]),
+    ]
+    shown = [i for i in order if done.blended.weights[i] > 0.01][:4]
+    for index in shown:
+        texture = textures.encoded(done.names[index])
+        side = min(len(texture), seen.resolution)
+        factor = seen.resolution // side
+        rows, columns = (slice(s.start // factor, s.stop // factor) for s in box)
+        name = f"{done.names[index]}: {done.blended.weights[index]:.0%}"
+        panels.append((name, shrink(texture, side)[rows, columns]))
+    size = 320
+    for name, (v, u) in _close_ups(seen).items():
+        rows = slice(max(v - size // 2, 0), v + size // 2)
+        columns = slice(max(u - size // 2, 0), u + size // 2)
+        panels.append((f"{name}, one to one", done.albedo[rows, columns]))
+    return contact_sheet(panels, columns=4, heading="complete albedo")
+
+
+def _close_ups(seen: SeenTexture) -> dict[str, tuple[int, int]]:
+    """Row and column in the middle of some regions of the synthesised part."""
+    names = seen.model.region_names
+    region = np.asarray(seen.model.region)[seen.vertex_of]
+    found = {}
+    for name in ("forehead", "nose", "cheeks", "lips"):
+        if name in names:
+            rows, columns = np.nonzero(seen.free & (region == names.index(name)))
+            if len(rows):
+                # Of two cheeks the one on the left of the map.
+                left = columns <= np.median(columns) if name == "cheeks" else columns >= 0
+                found[name] = int(np.median(rows[left])), int(np.median(columns[left]))
+    return found
+
+
+def _extend_report(
+    place: Path,
+    done: Completed,
+    textures: TextureDatabase,
+    network_licence: str,
+    seconds: float,
+    weights: list[dict[str, Any]],
+) -> None:
+    report: dict[str, Any]
+    try:
+        report = json.loads((place / "report.json").read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError):
+        report = {"title": place.name}
+
+    def joined(key: str, column: str, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Entries of before, less those that the new ones replace, and the new ones."""
+        fresh = {entry[column] for entry in new}
+        return [e for e in report.get(key, []) if e.get(column) not in fresh] + new
+
+    images = [{"title": name, "file": name} for name in ("completion.png", "albedo.png")]
+    report["images"] = joined("images", "file", images)
+    report["files"] = joined(
+        "files", "file", [{"file": name, "what": what} for name, what in _FILES.items()]
+    )
+    report["figures"] = joined(
+        "figures", "label",
+        [
+            {
+                "label": "relative duality gap of the blend",
+                "value": float(done.blended.relative_gap),
+                "unit": "",
+            },
+            {"label": "subjects blended", "value": len(weights), "unit": ""},
+        ],
+    )  # fmt: skip
+    report["energies"] = joined(
+        "energies", "name",
+        [
+            {
+                "name": f"synthesis {record['name']}",
+                "steps": len(record["values"]) - 1,
+                "terms": {"synthesis": record["values"]},
+            }
+            for record in done.levels
+        ],
+    )  # fmt: skip
+    report["timings"] = joined(
+        "timings", "name", [{"name": "complete albedo", "seconds": seconds, "compile_seconds": 0.0}]
+    )
+    table = {
+        "title": "blended subjects",
+        "header": ["subject", "weight"],
+        "rows": [[entry["subject"], entry["weight"]] for entry in weights],
+    }
+    report["tables"] = joined("tables", "title", [table])
+    report["licences"] = joined(
+        "licences", "name",
+        [
+            {"name": textures.name, "what": "texture database", "licence": textures.licence},
+            {"name": "feature network", "what": "texture statistics", "licence": network_licence},
+        ],
+    )  # fmt: skip
+    write_report(place, report)
+
+
+def parse_settings(
+    *,
+    detail: str | None = None,
+    photo: float | None = None,
+    **given: Any,
+) -> CompletionSettings:
+    """`CompletionSettings` from a command line.
+
+    Args:
+        detail: ``region=value,...``.
+        photo: weight of what the photo shows.
+        given: fields of `CompletionSettings`.
+
+    Raises:
+        ValueError: a value is out of range, or ``detail`` cannot be read.
+    """
+    regions = {}
+    for part in (detail or "").split(",") if detail else []:
+        name, _, value = part.partition("=")
+        try:
+            regions[name.strip()] = float(value)
+        except ValueError:
+            raise ValueError(f"--detail has {part!r}; region=value is needed") from None
+    settings = dataclasses.replace(CompletionSettings(), detail=regions, **given)
+    if photo is not None:
+        settings = dataclasses.replace(settings, weights=SynthesisWeights(photo=photo))
+    if settings.norm not in ("frobenius", "squared"):
+        raise ValueError(f"norm is {settings.norm!r}; it must be 'frobenius' or 'squared'")
+    if settings.start not in ("neighbour", "low_frequency"):
+        raise ValueError(f"start is {settings.start!r}; it must be 'neighbour' or 'low_frequency'")
+    if settings.iterations < 1 or not settings.alpha >= 0 or not (photo or 0) >= 0:
+        raise ValueError(
+            f"iterations {settings.iterations}, alpha {settings.alpha}, weight of the photo "
+            f"{photo}; needed are at least one iteration and weights of 0 or more"
+        )
+    return settings

@@ -1,0 +1,166 @@
+"""What one photo shows of a face's albedo, as the completion needs it."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Bool, Float
+from jaxface.geometry.uv import UVLayout, uv_layout
+from jaxface.imaging.resample import resize
+from jaxface.io.exr import read_exr, srgb_encoded
+from jaxface.io.fit_file import read_fit
+from jaxface.io.model_file import bundled_models
+from jaxface.io.models import load_model
+from jaxface.models.morphable import MorphableModel
+from jaxface.models.subdivide import subdivide
+from jaxface.stages.fit.prepared import FACE_REGIONS
+from jaxface.stages.low_frequency import low_frequency_albedo
+
+NOT_SKIN = ("eyes", "mouth_interior")
+
+
+@dataclass(frozen=True)
+class SeenTexture:
+    """Maps in the model's UVs, row 0 at the top; colours are sRGB-encoded."""
+
+    model: MorphableModel
+    photo: Float[np.ndarray, "r r 3"]
+    """partial albedo"""
+    weight: Float[np.ndarray, "r r"]
+    low_frequency: Float[np.ndarray, "r r 3"]
+    texels_per_pixel: float
+    """texels along a side of what one pixel of the photo covers, the median over what is seen"""
+    free: Bool[np.ndarray, "r r"]
+    """skin of the face, to be synthesised"""
+    skin: Bool[np.ndarray, "r r"]
+    """all skin, in the charts: not eyes, not the inside of the mouth"""
+    inside: Bool[np.ndarray, "r r"]
+    """the charts"""
+    vertex_of: np.ndarray
+    """(r, r) a vertex of each texel's triangle"""
+
+    @property
+    def resolution(self) -> int:
+        """Texels along a side."""
+        return len(self.photo)
+
+    def detail_map(self, regions: Mapping[str, float]) -> Float[np.ndarray, "r r"]:
+        """How much detail each texel may get, 1 where its region is not named.
+
+        Raises:
+            ValueError: the model has no such region, or a value is not in [0, 1].
+        """
+        values = np.ones(len(self.model.region_names) or 1, np.float32)
+        for name, value in regions.items():
+            if name not in self.model.region_names:
+                raise ValueError(
+                    f"the model has no region {name!r}; it has {list(self.model.region_names)}"
+                )
+            if not 0 <= value <= 1:
+                raise ValueError(f"detail of {name!r} is {value}; it needs to be in [0, 1]")
+            values[self.model.region_names.index(name)] = value
+        return values[np.asarray(self.model.region)[self.vertex_of]]
+
+
+def seen_texture(
+    model: MorphableModel,
+    albedo: Float[np.ndarray, "r r 3"],
+    weight: Float[np.ndarray, "r r"],
+    coefficients: Float[np.ndarray, "a"],
+    texels_per_pixel: float,
+) -> SeenTexture:
+    """From a partial albedo (linear RGB) and the albedo coefficients of a fit.
+
+    Raises:
+        ValueError: the texture is smaller than 256 texels along a side, or not square.
+    """
+    size = len(albedo)
+    if albedo.shape != (size, size, 3) or weight.shape != (size, size) or size < 256:
+        raise ValueError(
+            f"the partial albedo is {albedo.shape[:2]}, its weight {weight.shape}; both need to be "
+            "square, 256 texels or more"
+        )
+    layout: UVLayout = uv_layout(model.uv, model.uv_faces, size)
+    low = low_frequency_albedo(
+        jnp.asarray(albedo), jnp.asarray(weight),
+        model.reflectance(jnp.asarray(coefficients)), model.faces, layout,
+    )  # fmt: skip
+    triangle = np.maximum(np.asarray(layout.triangle), 0)
+    faces = np.asarray(model.faces)
+    inside = np.asarray(layout.inside)
+
+    def within(*names: str) -> np.ndarray:
+        known = [name for name in names if name in model.region_names]
+        if not known:
+            return np.zeros(size * size, bool).reshape(size, size)
+        covered = np.all(np.asarray(model.region_mask(*known))[faces], axis=1)
+        return np.asarray(covered)[triangle] & inside
+
+    face = within(*FACE_REGIONS) if model.region_names else inside
+    return SeenTexture(
+        model=model,
+        photo=srgb_encoded(np.asarray(albedo)),
+        weight=np.asarray(weight, np.float32),
+        low_frequency=srgb_encoded(np.asarray(low)),
+        texels_per_pixel=texels_per_pixel,
+        free=_largest_part(face),
+        skin=inside & ~within(*NOT_SKIN),
+        inside=inside,
+        vertex_of=faces[triangle, 0],
+    )
+
+
+def read_seen_texture(
+    folder: str | os.PathLike[str],
+    resolution: int | None = None,
+    model: str | os.PathLike[str] | None = None,
+) -> SeenTexture:
+    """From a folder that `save_fit` wrote.
+
+    Args:
+        folder: with ``fit.npz`` and ``albedo_partial.exr``.
+        resolution: texels along a side; as the partial albedo has by default.
+        model: file of the model, where it is not a bundled one.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or of another model.
+    """
+    place = Path(folder)
+    saved = read_fit(place / "fit.npz")
+    name = str(saved.metadata.get("model"))
+    if model is None and name not in bundled_models():
+        raise ValueError(f"{place} was fitted with model {name!r}; name its file with --model")
+    face = load_model(model or name)
+    if face.name != name or face.albedo.count != saved.parameters.albedo.shape[0]:
+        raise ValueError(f"{place} was fitted with model {name!r}, not with {face.name!r}")
+    partial = read_exr(place / "albedo_partial.exr")
+    if partial.shape[2] != 4:
+        raise ValueError(f"{place / 'albedo_partial.exr'} needs RGB and weight, 4 channels")
+    if "texels_per_pixel" not in saved.arrays:
+        raise ValueError(f"{place / 'fit.npz'} lacks texels_per_pixel; digitize the photo again")
+    scale = float(saved.arrays["texels_per_pixel"]) / len(partial)
+    albedo, weight = partial[..., :3], partial[..., 3:]
+    if resolution is not None and resolution != len(partial):
+        both = jnp.asarray(np.concatenate([albedo * weight, weight], axis=-1))
+        sized = np.asarray(resize(both, resolution, resolution))
+        albedo, weight = sized[..., :3] / np.maximum(sized[..., 3:], 1e-3), sized[..., 3:]
+    # One refinement, as the fit's finest level has, so that the base colours are as smooth.
+    finer = subdivide(face) if face.vertex_count < 20_000 else face
+    return seen_texture(
+        finer, albedo, weight[..., 0], np.asarray(saved.parameters.albedo), scale * len(albedo)
+    )
+
+
+def _largest_part(mask: Bool[np.ndarray, "r r"]) -> Bool[np.ndarray, "r r"]:
+    """The largest connected part: lips and lids line mouth and eyes too, in charts of their own."""
+    from skimage.measure import label
+
+    parts = np.asarray(label(mask, connectivity=1))
+    counts = np.bincount(parts.ravel())
+    counts[0] = 0
+    return parts == counts.argmax()

@@ -1,0 +1,149 @@
+"""Texture synthesis by matching Gram matrices (Saito 2017, section 5, equation 3).
+
+The intensity of every free texel is sought so that the feature statistics of the texture are the
+target's, coarse to fine in resolution.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxface._types import Array, Bool, Float
+from jaxface.energies.gram import MASKED, StyleTargets, style_energy
+from jaxface.energies.kept_detail import KnownDetail, known_detail_energy
+from jaxface.energies.term import Energy, Term, compose
+from jaxface.models.features import FeatureNetwork
+from jaxface.solvers.lbfgs import LBFGSState
+from jaxface.solvers.minimise import Method, minimise
+
+
+class SynthesisWeights(eqx.Module):
+    """Weights of the terms beside eq. 3, whose alpha is in the targets."""
+
+    photo: float | Array = 30.0
+    """of staying with what the photo shows; 0 gives the paper's energy"""
+    plain: float | Array = 30.0
+    """of staying with the low frequencies where the detail map is below 1"""
+
+
+class SynthesisProblem(eqx.Module):
+    """One level of a synthesis."""
+
+    network: FeatureNetwork
+    targets: StyleTargets
+    free: Bool[Array, "h w"]
+    """texels to find; the others are ``MASKED`` for the statistics, as in the targets'"""
+    known: KnownDetail
+    blur: Float[Array, ""]
+    """of what the photo shows, standard deviation in texels"""
+    weights: SynthesisWeights
+
+
+class Synthesis(NamedTuple):
+    """A synthesised intensity.
+
+    Attributes:
+        image: (h, w), in (0, 1) where free, the start elsewhere.
+        values: energy before the first step and after each.
+        terms: the weighted energy of each term at the end.
+        evaluations: of energy and gradient.
+        state: of the solver, to go on from.
+    """
+
+    image: Float[Array, "h w"]
+    values: list[float]
+    terms: dict[str, float]
+    evaluations: int
+    state: LBFGSState | None
+
+
+def synthesis_energy(tile: int | None = None, method: str = "auto") -> Energy:
+    """Equation 3 and the known detail as composed terms of ``(image, SynthesisProblem)``.
+
+    Args:
+        tile: where given, statistics are summed over tiles of this side (see ``energies.gram``).
+        method: of the convolutions.
+    """
+
+    def style(image: Array, problem: SynthesisProblem) -> Array:
+        shown = jnp.where(problem.free, image, jnp.asarray(MASKED, image.dtype))
+        return style_energy(problem.network, shown, problem.targets, tile, method)
+
+    def known(image: Array, problem: SynthesisProblem) -> Array:
+        held = jnp.where(problem.free, image, problem.known.low_frequency)
+        weights = problem.weights
+        return known_detail_energy(held, problem.known, problem.blur, weights.photo, weights.plain)
+
+    return compose([Term("style", style, 1.0, "scalar"), Term("known", known, 1.0, "scalar")])
+
+
+def synthesise(
+    start: Float[Array, "h w"],
+    problem: SynthesisProblem,
+    *,
+    steps: int = 100,
+    method: Method = "lbfgs",
+    tile: int | None = None,
+    convolution: str = "auto",
+    rtol: float = 1e-4,
+    on_step: Callable[[int, float, Callable[[], Array]], bool | None] | None = None,
+) -> Synthesis:
+    """Minimise equation 3 (and the known detail) over the free texels, by L-BFGS.
+
+    Intensities stay within (0, 1): the unknown is ``artanh(2 I - 1)``.
+
+    Args:
+        start: first intensities; the low-frequency albedo in the paper.
+        problem: network, targets, free texels, known detail.
+        steps: greatest number of L-BFGS steps.
+        method: back end, see ``solvers.minimise``.
+        tile: side of the tiles in which statistics are summed, where memory must be bounded.
+        convolution: see ``models.conv3x3``.
+        rtol: stops when ten steps together gain less than this part of the energy.
+        on_step: called after each step with its number, the energy, and a function that gives the
+            image so far; True stops.
+
+    Raises:
+        ValueError: shapes differ, or the start is not finite.
+    """
+    if not start.shape == problem.free.shape == problem.known.photo.shape:
+        raise ValueError(
+            f"start is {start.shape}, free {problem.free.shape}, the photo "
+            f"{problem.known.photo.shape}; they must be of one shape"
+        )
+    if not bool(jnp.all(jnp.isfinite(start))):
+        raise ValueError("the start of the synthesis has values that are not finite")
+    energy = synthesis_energy(tile, convolution)
+
+    def of_unknown(z: Array, problem: SynthesisProblem) -> Array:
+        return energy.value(_intensity(z), problem)[0]
+
+    def watch(step: int, state: LBFGSState) -> bool | None:
+        assert on_step is not None
+
+        def image() -> Array:
+            return jnp.where(problem.free, _intensity(state.y.reshape(start.shape)), start)
+
+        return on_step(step, float(state.value), image)
+
+    first = jnp.arctanh(2 * jnp.clip(start, 0.004, 0.996) - 1)
+    hooks: dict[str, Any] = {}
+    if method == "lbfgs" and on_step is not None:
+        hooks["on_step"] = watch
+    found = minimise(of_unknown, first, problem, method=method, steps=steps, rtol=rtol, **hooks)
+    image = jnp.where(problem.free, _intensity(found.value), start)
+    terms = jax.jit(energy.value)(image, problem)[1]
+    return Synthesis(
+        image,
+        found.stats.get("values", []),
+        {name: float(value) for name, value in terms.items()},
+        int(found.stats.get("evaluations", 0)),
+        found.stats.get("state"),
+    )
+
+
+def _intensity(z: Array) -> Array:
+    return 0.5 + 0.5 * jnp.tanh(z)
