@@ -66,7 +66,7 @@ def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> D
     """Density of the beard: strokes, and the blue-grey of the roots under the skin."""
     patchy = gradient_noise(patch.position, 12.0, layer_seed(seed, 50))
     lean = 0.23 * gradient_noise(patch.position, 12.0, layer_seed(seed, 51))
-    where = jnp.clip(patch.regions.beard * (1.15 + 0.13 * patchy) - 0.12, 0.0, 1.0)
+    where = jnp.clip(patch.regions.beard * (1.3 + 0.15 * patchy) - 0.1, 0.0, 1.0)
     grown = 0.25 + 0.75 * traits.stubble
     hairs = _strokes(
         patch, patch.hair, STUBBLE_CELL, where * (0.35 + 0.65 * traits.stubble), lean, 1.0,

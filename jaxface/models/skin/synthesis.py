@@ -115,7 +115,7 @@ def base_albedo(
     albedo = albedo + (0.8 * r.lips)[:, None] * (0.8 * lip + 0.2 * cheek - albedo)
     redness = albedo[:, 0] / albedo[:, 1] - cheek[0] / cheek[1]
     sore = smoothstep(redness, 0.3, 1.0) * (1 - r.lips) * r.skin
-    return albedo + (0.85 * sore)[:, None] * (jnp.array([0.85, 0.62, 0.6]) * cheek - albedo)
+    return albedo + (0.85 * sore)[:, None] * (jnp.array([0.8, 0.68, 0.66]) * cheek - albedo)
 
 
 def _skin(patch: SkinPatch, base: Vector, traits: SkinAttributes, seed: Int[Array, ""]) -> Vector:
