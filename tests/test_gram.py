@@ -26,6 +26,10 @@ SHAPE = ((2, 6), (1, 8), (2, 8))
 WIDE = ((1, 16), (2, 16))  # wide enough for Winograd
 LAYERS = ("conv1_1", "conv2_1", "conv3_2")
 
+value_and_grad = jax.jit(style_value_and_grad, static_argnums=(3, 4))
+grams_of = jax.jit(grams, static_argnums=(2, 3))
+features_of = jax.jit(features, static_argnums=2)
+
 
 @pytest.fixture(scope="module")
 def network() -> FeatureNetwork:
@@ -42,8 +46,8 @@ def picture(seed: int, *shape: int):
 
 def targets_of(network: FeatureNetwork, image, map_layers=("conv2_1", "conv3_1")) -> StyleTargets:
     return StyleTargets(
-        grams(network, image, LAYERS),
-        features(network, image, map_layers),
+        grams_of(network, image, LAYERS),
+        features_of(network, image, map_layers),
         alpha=30.0,
         gram_weights={"conv3_2": 0.25},
         feature_weights={"conv2_1": 2.0},
@@ -83,7 +87,7 @@ def test_mask_out_is_half_where_not_visible():
 def test_energy_is_equation_3(network, x64):
     wide, image = double(network), picture(0, 13, 18)
     targets = targets_of(wide, picture(1, 13, 18))
-    found = features(wide, image, ("conv1_1", "conv2_1", "conv3_1", "conv3_2"))
+    found = features_of(wide, image, ("conv1_1", "conv2_1", "conv3_1", "conv3_2"))
     expected = 0.0
     for layer, target in targets.grams.items():
         flat = np.asarray(found[layer]).reshape(-1, target.shape[0])
@@ -105,29 +109,31 @@ def test_energy_derivatives(network, tile, x64):
     check_grads(energy, (image,), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("pooling", ["average", "max"])
-@pytest.mark.parametrize(("shape", "tile"), [((24, 40), 8), ((13, 18), 4), ((17, 35), 16)])
+@pytest.mark.parametrize(
+    ("pooling", "shape", "tile"),
+    [("average", (24, 40), 8), ("max", (17, 35), 16), ("average", (13, 18), 4)],
+)
 def test_tiles_change_nothing(network, pooling, shape, tile, x64):
     wide = double(FeatureNetwork(network.kernels, network.biases, pooling))
     image, targets = picture(0, *shape), targets_of(wide, picture(1, *shape))
-    value, gradient = style_value_and_grad(wide, image, targets)
-    tiled_value, tiled_gradient = jax.jit(style_value_and_grad, static_argnums=3)(
-        wide, image, targets, tile
-    )
+    value, gradient = value_and_grad(wide, image, targets)
+    tiled_value, tiled_gradient = value_and_grad(wide, image, targets, tile)
     assert float(tiled_value) == pytest.approx(float(value), rel=1e-12)
     np.testing.assert_allclose(tiled_gradient, gradient, atol=1e-12 * float(abs(gradient).max()))
-    whole, tiled = grams(wide, image, LAYERS), grams(wide, image, LAYERS, tile)
-    for layer in LAYERS:
-        np.testing.assert_allclose(tiled[layer], whole[layer], rtol=1e-11, atol=1e-13)
+    tiled = grams_of(wide, image, LAYERS, tile)
+    for layer, whole in grams_of(wide, image, LAYERS).items():
+        np.testing.assert_allclose(tiled[layer], whole, rtol=1e-11, atol=1e-13)
 
 
 def test_tiles_in_single_precision():
     network = random_network(WIDE)
     image, other = (picture(i, 45, 70).astype(jnp.float32) for i in range(2))
     layers = ("conv1_1", "conv2_2")
-    targets = StyleTargets(grams(network, other, layers), features(network, other, layers[1:]))
-    value, gradient = style_value_and_grad(network, image, targets)
-    tiled_value, tiled_gradient = style_value_and_grad(network, image, targets, 32)
+    targets = StyleTargets(
+        grams_of(network, other, layers), features_of(network, other, layers[1:])
+    )
+    value, gradient = value_and_grad(network, image, targets)
+    tiled_value, tiled_gradient = value_and_grad(network, image, targets, 32)
     assert float(tiled_value) == pytest.approx(float(value), rel=1e-5)
     # A response that rounding moves across zero switches its whole gradient on or off.
     error = jnp.linalg.norm(tiled_gradient - gradient) / jnp.linalg.norm(gradient)
@@ -137,9 +143,8 @@ def test_tiles_in_single_precision():
 def test_tiles_bound_the_memory(network):
     def temporary(side: int, tile: int | None) -> int:
         image = jax.ShapeDtypeStruct((side, side), jnp.float32)
-        targets = StyleTargets(grams(network, jnp.zeros((16, 16)), LAYERS))
-        run = jax.jit(style_value_and_grad, static_argnums=3)
-        program = run.lower(network, image, targets, tile).compile()
+        targets = StyleTargets(grams_of(network, jnp.zeros((16, 16)), LAYERS))
+        program = value_and_grad.lower(network, image, targets, tile).compile()
         return program.memory_analysis().temp_size_in_bytes - 4 * 4 * side**2  # less some images
 
     assert temporary(512, 64) < 1.5 * temporary(256, 64) < 0.5 * temporary(512, None)
@@ -151,7 +156,7 @@ def test_singular_images_have_finite_gradients(network, tile):
     targets = targets_of(network, picture(1, *shape).astype(jnp.float32))
     hidden = mask_out(picture(0, *shape).astype(jnp.float32), jnp.zeros(shape, bool))
     for image in (hidden, jnp.zeros(shape), jnp.ones(shape)):
-        value, gradient = style_value_and_grad(network, image, targets, tile)
+        value, gradient = value_and_grad(network, image, targets, tile)
         assert bool(jnp.isfinite(value)) and bool(jnp.all(jnp.isfinite(gradient)))
     zero = {layer: jnp.zeros_like(g) for layer, g in targets.grams.items()}
     assert bool(jnp.all(jnp.isfinite(jax.grad(lambda g: gram_loss(g, zero))(zero)["conv1_1"])))
@@ -162,9 +167,10 @@ def test_gradient_with_respect_to_targets_and_weights(network, x64):
     targets = targets_of(wide, picture(1, 12, 12))
     slope = jax.grad(lambda t: style_energy(wide, image, t))(targets)
     assert float(slope.alpha) == pytest.approx(
-        float(gram_loss(grams(wide, image, LAYERS), targets.grams, targets.gram_weights)), rel=1e-9
+        float(gram_loss(grams_of(wide, image, LAYERS), targets.grams, targets.gram_weights)),
+        rel=1e-9,
     )
-    found = grams(wide, image, LAYERS)
+    found = grams_of(wide, image, LAYERS)
     expected = 2 * 30 * 0.25 * (targets.grams["conv3_2"] - found["conv3_2"])
     np.testing.assert_allclose(slope.grams["conv3_2"], expected, rtol=1e-9)
 
@@ -180,7 +186,7 @@ def test_energies_map_over_images(network):
 def test_wrong_arguments_are_named(network):
     image = jnp.zeros((24, 24))
     with pytest.raises(ValueError, match="tile is 6; needed is a positive multiple of 4"):
-        grams(network, image, LAYERS, tile=6)
+        grams_of(network, image, LAYERS, tile=6)
     with pytest.raises(ValueError, match="no weights for conv4_1"):
         tiling(network, (24, 24), ("conv4_1",), 16)
     with pytest.raises(ValueError, match=r"Gram target of conv1_1 has shape \(2, 2\)"):
