@@ -66,7 +66,7 @@ def random_attributes(key: Array) -> SkinAttributes:
     male = (uniform() < 0.5).astype(jnp.float32)
     age = 18.0 + 62.0 * uniform() ** 1.4
     old = (age - 18.0) / 62.0
-    melanin = -0.45 + 1.9 * uniform() ** 1.7
+    melanin = -0.45 + 2.2 * uniform() ** 1.8
     fair = jnp.clip(1.0 - (melanin + 0.45) / 0.7, 0.0, 1.0)
     return SkinAttributes(
         male=male,

@@ -70,11 +70,11 @@ def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> D
     grown = 0.25 + 0.75 * traits.stubble
     hairs = _strokes(
         patch, patch.hair, STUBBLE_CELL, where * (0.35 + 0.65 * traits.stubble), lean, 1.0,
-        (0.12, 0.12 + 0.36 * grown), HALF_WIDTH, layer_seed(seed, 52), layers=3,
+        (0.12, 0.12 + 0.36 * grown), HALF_WIDTH, layer_seed(seed, 52), layers=4,
     )  # fmt: skip
     dark = (0.3 + 0.7 * traits.hair_melanin) * where**0.5
-    hairs = 1.35 * (0.35 + 0.65 * traits.stubble) * dark * hairs
-    shadow = 0.17 * traits.stubble * dark * where
+    hairs = 1.8 * (0.35 + 0.65 * traits.stubble) * dark * hairs
+    shadow = 0.25 * traits.stubble * dark * where
     # Roots seen through the skin look blue: melanin's share is negative to take away yellow.
     return Density(0.25 * hairs - 0.5 * shadow, -0.15 * shadow, 0.75 * hairs + 1.4 * shadow)
 

@@ -21,7 +21,9 @@ def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> 
     blood = spectrum_noise(patch.position, WAVES, BLOOD, patch.texel, layer_seed(seed, 1))
     melanin = spectrum_noise(patch.position, WAVES, MELANIN, patch.texel, layer_seed(seed, 2))
     r = patch.regions
-    vivid = traits.mottling * (1.0 + 0.4 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.35 * r.forehead)
+    vivid = traits.mottling * (
+        1.0 + 0.4 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.35 * r.forehead
+    )
     return Density(traits.mottling * melanin, vivid * blood)
 
 

@@ -112,7 +112,8 @@ def base_albedo(
         return weight @ albedo / jnp.maximum(jnp.sum(weight), 1e-6)
 
     lip, cheek = mean_over(r.lips * (r.lips > 0.9)), mean_over(r.cheek)
-    albedo = albedo + (0.8 * r.lips)[:, None] * (0.8 * lip + 0.2 * cheek - albedo)
+    pale = 0.2 + 0.3 * attributes.male
+    albedo = albedo + (0.8 * r.lips)[:, None] * ((1 - pale) * lip + pale * cheek - albedo)
     redness = albedo[:, 0] / albedo[:, 1] - cheek[0] / cheek[1]
     sore = smoothstep(redness, 0.3, 1.0) * (1 - r.lips) * r.skin
     return albedo + (0.85 * sore)[:, None] * (jnp.array([0.8, 0.68, 0.66]) * cheek - albedo)
