@@ -1,8 +1,9 @@
 """The reduced blending problems in other solvers' words. Each function solves once.
 
 ``points`` is (k, m) for the quadratic programme ``min ||w^T points||^2``, (k, l, m) for the cone
-problem ``min sum_l ||w^T points_l||``; both over the simplex. The solvers get what `jaxface` gets, the
-reduced problem, scaled to order one; those of quadratic programmes also its Hessian for nothing.
+problem ``min sum_l ||w^T points_l||``; both over the simplex. The solvers get what jaxface's get,
+the reduced problem, scaled to order one; those of quadratic programmes also its Hessian for
+nothing.
 """
 
 import numpy as np

@@ -145,7 +145,8 @@ def test_nearest_subject(problem):
     database, target = problem
     for norm in NORMS:
         found = nearest_subject(database, target, norm=norm, weights={"conv2_1": 0.5})
-        every = [objective(database, target, w, norm, {"conv2_1": 0.5}) for w in np.eye(25)]
+        factors = {"conv2_1": 0.5}
+        every = np.array([objective(database, target, w, norm, factors) for w in np.eye(25)])
         np.testing.assert_allclose(found.stats["objectives"], every, rtol=1e-9)
         assert np.argmax(found.weights) == np.argmin(every) and found.weights.sum() == 1
         np.testing.assert_allclose(found.objective, min(every), rtol=1e-9)
@@ -274,6 +275,6 @@ def broken(database, target, kind):
     ],
 )
 def test_errors_say_what_is_wrong(problem, kind, message):
-    database, target, options = broken(*problem, kind)
+    database, target, options = broken(problem[0], problem[1], kind)
     with pytest.raises(ValueError, match=message):
         blend(database, target, **options)

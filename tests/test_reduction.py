@@ -52,7 +52,8 @@ def test_triangular_factor_keeps_lengths(kind, rows):
     exact = np.linalg.norm(combinations @ matrix.T, axis=1)
     found = np.linalg.norm(combinations @ factor.T, axis=1)
     # Backward stable: also short combinations are right to the rounding of the long ones.
-    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-13 * np.linalg.norm(matrix))
+    size = float(np.linalg.norm(matrix))
+    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-13 * size)
 
 
 def test_triangular_factor_refuses_nan():

@@ -12,6 +12,7 @@ would otherwise lose.
 """
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +59,7 @@ def triangular_factor(
 
 def _gram(blocks: Iterable[np.ndarray], columns: int, factor: np.ndarray | None) -> np.ndarray:
     total = np.zeros((columns, columns))
-    divide = scipy.linalg.get_blas_funcs("trsm", dtype=np.float64)
+    divide: Any = scipy.linalg.get_blas_funcs("trsm", dtype=np.float64)
     for block in blocks:
         if factor is not None:  # rows of M S^-1, transposed
             block = divide(1.0, factor, block.T, side=1, overwrite_b=1).T
