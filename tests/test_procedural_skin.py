@@ -26,7 +26,8 @@ def grid(side: float, count: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     u, v = jnp.meshgrid(jnp.linspace(0, side, count), jnp.linspace(0, side, count))
     u, v = u.ravel(), v.ravel()
     a, b = np.array([1, -1, 0]) / np.sqrt(2), np.array([1, 1, -2]) / np.sqrt(6)
-    return tuple(jnp.asarray(a[k] * u + b[k] * v + 40.0, jnp.float32) for k in range(3))
+    x, y, z = (jnp.asarray(a[k] * u + b[k] * v + 40.0, jnp.float32) for k in range(3))
+    return x, y, z
 
 
 NORMAL = tuple(jnp.full(1, 1 / np.sqrt(3), jnp.float32) for _ in range(3))

@@ -165,6 +165,7 @@ def test_a_head_of_the_model_is_found_again(tmp_path):
         tmp_path / "scan.obj", moved, np.asarray(model.faces),
         uv=np.asarray(model.uv), uv_polygons=np.asarray(model.uv_faces),
     )  # fmt: skip
+    assert model.landmarks68 is not None
     marks = np.asarray(model.landmarks68(jnp.asarray(moved)))
     (tmp_path / "marks.json").write_text(json.dumps({
         "schema": "jaxface-landmarks/1", "scheme": "ibug68", "image_size": None,

@@ -72,6 +72,11 @@ def test_it_goes_on_where_it_stopped(tmp_path, model):
     new(tmp_path, model).write_subject("one", ramp())
     again = new(tmp_path, model)
     assert again.is_whole("one") and not again.is_whole("two")
+    more = TextureDatabase.create(
+        tmp_path, model, 16, name="x", licence="y", credits=["nobody", "somebody"]
+    )
+    assert more.credits == TextureDatabase(tmp_path).credits == ("nobody", "somebody")
+    assert more.name == "some" and more.names == ("one",)
     with pytest.raises(ValueError, match="16 texels, not 32"):
         new(tmp_path, model, 32)
     write_png(tmp_path / "textures" / "one.png", np.zeros((8, 8, 3), np.uint8))

@@ -80,7 +80,7 @@ def non_rigid_icp(
     Amberg, Romdhani and Vetter, "Optimal step nonrigid ICP algorithms for surface registration",
     CVPR 2007: every vertex has an affine transformation of its own; with the closest points held,
     distances + stiffness * differences along edges + landmarks is a sparse linear least-squares
-    problem (its equation 12), which is solved exactly.
+    problem (its section 4), which is solved exactly.
 
     Args:
         template: vertices, roughly in place.
@@ -164,7 +164,7 @@ def non_rigid_icp(
 
 
 def _stiffness_matrix(faces: np.ndarray, count: int, skew: float) -> sparse.csr_matrix:
-    """``M (x) G``: differences of neighbours' transformations (Amberg 2007, equation 5)."""
+    """``M (x) G``: differences of neighbours' transformations (the paper's stiffness term)."""
     pairs = edges(faces)
     row = np.repeat(np.arange(len(pairs)), 2)
     sign = np.tile([-1.0, 1.0], len(pairs))
@@ -173,7 +173,7 @@ def _stiffness_matrix(faces: np.ndarray, count: int, skew: float) -> sparse.csr_
 
 
 def _positions_matrix(points: np.ndarray) -> sparse.csr_matrix:
-    """``D``: row i applies transformation i to vertex i in homogeneous coordinates (eq. 8)."""
+    """``D``: row i applies transformation i to vertex i in homogeneous coordinates."""
     count = len(points)
     values = np.concatenate([points, np.ones((count, 1))], axis=1)
     columns = 4 * np.arange(count)[:, None] + np.arange(4)

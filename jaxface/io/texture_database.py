@@ -120,7 +120,7 @@ class TextureDatabase:
         licence: str,
         credits: Sequence[str] = (),
     ) -> "TextureDatabase":
-        """Begin a database, or go on with the one that lies there.
+        """Begin a database, or go on with the one that lies there, adding to its credits.
 
         Raises:
             ValueError: a database of other UVs or another resolution lies there, or the
@@ -135,19 +135,18 @@ class TextureDatabase:
                     f"{path} holds textures of {present.resolution} texels, not {resolution}; "
                     "choose another folder"
                 )
+            added = [line for line in credits if line not in present.credits]
+            if added:
+                present.credits = (*present.credits, *added)
+                present._write_index(present._subjects)
             return present
-        content = {
-            "schema": SCHEMA,
-            "name": name,
-            "licence": licence,
-            "credits": list(credits),
-            "uv": {"model": model.name, "digest": uv_digest(model)},
-            "resolution": resolution,
-            "subjects": [],
-        }
-        with atomic_path(Path(path) / INDEX) as temporary:
-            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        return cls(path, model)
+        database = cls.__new__(cls)
+        database.path, database.name, database.licence = Path(path), name, licence
+        database.credits, database.resolution = tuple(credits), resolution
+        database.model, database.digest = model.name, uv_digest(model)
+        database._subjects = {}
+        database._write_index({})
+        return database
 
     @property
     def subjects(self) -> tuple[Subject, ...]:
@@ -239,10 +238,9 @@ class TextureDatabase:
             name, f"textures/{name}.png", licence or self.licence, dict(attributes or {})
         )
         entries = {**self._subjects, name: subject}
-        text = json.dumps(self._content(entries), indent=1, allow_nan=False)
+        json.dumps(subject.attributes, allow_nan=False)  # raises before anything is written
         write_png(self.path / subject.file, srgb_encoded(texture))
-        with atomic_path(self.path / INDEX) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
+        self._write_index(entries)
         self._subjects = entries
         return subject
 
@@ -262,8 +260,8 @@ class TextureDatabase:
             "missing": [s.name for s in self.subjects if not self.is_whole(s.name)],
         }
 
-    def _content(self, subjects: Mapping[str, Subject]) -> dict[str, Any]:
-        return {
+    def _write_index(self, subjects: Mapping[str, Subject]) -> None:
+        content = {
             "schema": SCHEMA,
             "name": self.name,
             "licence": self.licence,
@@ -272,6 +270,8 @@ class TextureDatabase:
             "resolution": self.resolution,
             "subjects": [asdict(subject) for subject in subjects.values()],
         }
+        with atomic_path(self.path / INDEX) as temporary:
+            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def check_name(name: str) -> None:

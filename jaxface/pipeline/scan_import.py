@@ -91,7 +91,7 @@ def register_scan(
         FileNotFoundError: a file is absent.
         ValueError: the scan has no texture coordinates, or its landmarks cannot be found.
     """
-    scan = read_obj(mesh)
+    scan = read_obj(Path(mesh))
     _texture_coordinates(scan)
     model = load_model("makehuman") if model is None else model
     if landmarks is not None:
@@ -189,7 +189,7 @@ def import_scan(
         landmarks: see `register_scan`.
         attributes: recorded with the subject.
         name: of a new database.
-        credits: lines for a new database.
+        credits: lines added to the database's; by default the licence.
         on_progress: called with (stage, stages) of the registration.
 
     Raises:
@@ -198,7 +198,7 @@ def import_scan(
     """
     model = load_model("makehuman")
     database = TextureDatabase.create(
-        out, model, resolution, name=name, licence=licence, credits=credits
+        out, model, resolution, name=name, licence=licence, credits=credits or (licence,)
     )
     registered = register_scan(
         mesh, albedo, model=model, landmarks=landmarks, on_progress=on_progress

@@ -65,7 +65,7 @@ def skin_fields(model: MorphableModel) -> SkinFields:
     marks = np.asarray(model.landmarks68(model.mean), np.float64)
     normal = np.asarray(vertex_normals(model.mean, model.faces), np.float64)
     neighbours = vertex_neighbours(np.asarray(model.faces), len(position))
-    regions = _regions(model, position, normal, marks, neighbours)
+    regions = _regions(model, position, marks, neighbours)
     tension = _tangent(_tension(position, marks), normal)
     down = np.stack([0.25 * np.tanh(position[:, 0] / 20), -np.ones(len(position)),
                      0.15 * np.ones(len(position))], axis=1)  # fmt: skip
@@ -83,7 +83,6 @@ def skin_fields(model: MorphableModel) -> SkinFields:
 def _regions(
     model: MorphableModel,
     position: np.ndarray,
-    normal: np.ndarray,
     marks: np.ndarray,
     neighbours: Int[np.ndarray, "n v"],
 ) -> dict[str, np.ndarray]:
@@ -179,7 +178,8 @@ def _tension(position: np.ndarray, marks: np.ndarray) -> np.ndarray:
                   1.2 * np.exp(-0.5 * np.sum((mouth / [26, 18]) ** 2, axis=1))))  # fmt: skip
     cheek = np.arctan2(-0.85 * np.ones(len(side)), 0.5 * side)
     angle.append((cheek, 0.5 * (1 - _step(position[:, 1], -15, 10))))
-    axis = sum(w[:, None] * np.stack([np.cos(2 * a), np.sin(2 * a)], axis=1) for a, w in angle)
+    axes = [w[:, None] * np.stack([np.cos(2 * a), np.sin(2 * a)], axis=1) for a, w in angle]
+    axis = np.sum(axes, axis=0)
     half = 0.5 * np.arctan2(axis[:, 1], axis[:, 0])
     return np.stack([np.cos(half), np.sin(half), np.zeros(len(half))], axis=1)
 
