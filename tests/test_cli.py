@@ -90,11 +90,15 @@ def test_digitize_demo_then_a_folder_that_resumes(tmp_path):
     from skimage import data
 
     small = ("--size", "128", "--levels", "6,2", "--details", "0,0")
-    answer = run("digitize", "demo", "-o", tmp_path / "one", *small, "--resolution", "256")
+    answer = run(
+        "digitize", "demo", "-o", tmp_path / "one", *small, "--resolution", "256",
+        "--iterations", "6",
+    )  # fmt: skip
     assert answer.exit_code == 0, answer.output
     names = (
         "mesh.obj", "mesh.glb", "fit.npz", "albedo_partial.exr", "albedo_partial.png",
-        "visibility.png", "overlay.png", "report.html", "report.json",
+        "visibility.png", "overlay.png", "report.html", "report.json", "albedo.exr",
+        "albedo.png", "blend.json", "grams.npz", "completion.png",
     )  # fmt: skip
     assert not [n for n in names if not (tmp_path / "one" / n).is_file()]
     saved = read_fit(tmp_path / "one" / "fit.npz")
@@ -103,6 +107,13 @@ def test_digitize_demo_then_a_folder_that_resumes(tmp_path):
     assert set(saved.metadata["energies"]) >= {"total", "photo", "landmark", "prior"}
     report = json.loads((tmp_path / "one" / "report.json").read_text())
     assert report["energies"] and report["timings"] and report["licences"]
+    blend = json.loads((tmp_path / "one" / "blend.json").read_text())
+    assert abs(sum(entry["weight"] for entry in blend["weights"]) - 1) < 1e-5
+    assert blend["relative_gap"] <= 1e-6
+    assert (tmp_path / "one" / "albedo.png").read_bytes() in (
+        tmp_path / "one" / "mesh.glb"
+    ).read_bytes()
+    assert not (tmp_path / "one" / ".completion").exists()
 
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxface.cli import textures
-from jaxface.cli.console import bar, console, errors, progress
+from jaxface.cli.console import bar, console, errors, progress, steps
 from jaxface.io.cache import enable_compilation_cache
 
 app = typer.Typer(
@@ -78,11 +78,21 @@ def digitize(
     details: DetailsOption = None,
     self_shadow: ShadowOption = True,
     resolution: ResolutionOption = 2048,
+    complete: Annotated[
+        bool, typer.Option(help="Complete the albedo where the photo does not show it.")
+    ] = True,
+    database: textures.DatabaseOption = None,
+    features: textures.FeaturesOption = "random",
+    iterations: textures.IterationsOption = 1000,
 ) -> None:
-    """The whole journey: fit a photo, take its albedo, write mesh, maps and report."""
+    """The whole journey: fit a photo, complete its albedo, write mesh, maps and report."""
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
     options["self_shadow"] = self_shadow
-    _run(photo, out, with_texture=True, resolution=resolution, **options)
+    _run(
+        photo, out, with_texture=True, resolution=resolution, complete=complete, completion={
+            "database": database, "features": features, "iterations": iterations
+        }, **options,
+    )  # fmt: skip
 
 
 @app.command()
@@ -237,8 +247,8 @@ def _run(photo: str, out: Path, **options: Any) -> None:
         return
     from jaxface.pipeline import digitize as run
 
-    with errors(), progress(f"fitting {photo}"):
-        fitted = run(photo, out, **options)
+    with errors(), steps(str(photo)) as on_step:
+        fitted = run(photo, out, on_step=on_step, **options)
     console.print(
         f"landmark error {fitted.landmark_error():.1%} of the eye distance; "
         f"open [bold]{out / 'report.html'}[/bold]"

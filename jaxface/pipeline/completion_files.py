@@ -29,6 +29,9 @@ from jaxface.pipeline.seen_texture import SeenTexture, read_seen_texture
 from jaxface.pipeline.skin_database import synth_database
 from jaxface.stages.synthesise import SynthesisWeights
 
+PAINTED_MODEL = "makehuman"
+"""in whose UVs the procedural skins are"""
+
 SUBJECTS = 24
 """of the procedural database that is made where none is named"""
 
@@ -56,6 +59,7 @@ def complete_folder(
     features: str = "random",
     resolution: int | None = None,
     settings: CompletionSettings | None = None,
+    iterations: int | None = None,
     model: str | os.PathLike[str] | None = None,
     on_step: OnStep = lambda what, done, of: None,
 ) -> Completed:
@@ -71,6 +75,7 @@ def complete_folder(
         features: name or file of the feature network, see `load_network`.
         resolution: texels along a side; as the partial albedo has by default.
         settings: see `CompletionSettings`.
+        iterations: in place of that of the settings.
         model: file of the model, where the fit is not of a bundled one.
         on_step: told of every step.
 
@@ -79,6 +84,8 @@ def complete_folder(
         ValueError: files are damaged or do not fit together.
     """
     place, settings = Path(folder), settings or CompletionSettings()
+    if iterations is not None:
+        settings = dataclasses.replace(settings, iterations=iterations)
     started = time.perf_counter()
     network = load_network(features)
     seen = read_seen_texture(place, resolution, model)
@@ -120,10 +127,10 @@ def open_database(
     """
     if path is not None:
         return TextureDatabase(path, load_model(model))
-    if str(model) != "makehuman":
+    if str(model) != PAINTED_MODEL:
         raise ValueError(
-            f"the procedural skins are painted for the model 'makehuman', not for {str(model)!r}; "
-            "name a database in this model's UVs"
+            f"the procedural skins are painted for {PAINTED_MODEL!r}, not for {str(model)!r}; name "
+            "a database in this model's UVs"
         )
     size = min(resolution, LARGEST_DATABASE)
     folder = databases_dir() / f"procedural-{size}"

@@ -1,14 +1,17 @@
 """Whole journeys: a photo or a folder of photos in, a folder of results out."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxface.io.fit_file import read_fit
 from jaxface.io.image import Photo
 from jaxface.io.landmark_file import read_landmarks
+from jaxface.pipeline.completion_files import PAINTED_MODEL, OnStep, complete_folder
 from jaxface.pipeline.fitting import FittedFace, as_photo, fit
 from jaxface.pipeline.saving import save_fit
 from jaxface.pipeline.texturing import texture
@@ -40,6 +43,9 @@ def digitize(
     *,
     resolution: int = 2048,
     with_texture: bool = True,
+    complete: bool = False,
+    completion: Mapping[str, Any] | None = None,
+    on_step: OnStep = lambda what, done, of: None,
     title: str | None = None,
     landmarks_file: str | os.PathLike[str] | None = None,
     mask_file: str | os.PathLike[str] | None = None,
@@ -52,6 +58,9 @@ def digitize(
         out: folder.
         resolution: of the texture, texels along a side.
         with_texture: take the albedo from the photo.
+        complete: complete the albedo, by `complete_folder`; only with ``with_texture``.
+        completion: its options.
+        on_step: told of the steps of the completion.
         title: name for the report; the file's by default.
         landmarks_file: points to use instead of detection.
         mask_file: image of the photo's size, white on skin.
@@ -71,7 +80,22 @@ def digitize(
     fitted = fit(photo, **options)
     textured = texture(fitted, resolution) if with_texture else None
     save_fit(fitted, out, textured=textured, title=title or "photo")
+    if complete and with_texture:
+        _complete(out, fitted.model.name, completion or {}, on_step)
     return fitted
+
+
+def _complete(
+    out: str | os.PathLike[str], model: str, completion: Mapping[str, Any], on_step: OnStep
+) -> None:
+    if model != PAINTED_MODEL and completion.get("database") is None:
+        warnings.warn(
+            f"the albedo is left partial: the procedural skins are painted for {PAINTED_MODEL!r}, "
+            f"and no database in the UVs of {model!r} is named",
+            stacklevel=3,
+        )
+        return
+    complete_folder(out, on_step=on_step, **completion)
 
 
 class FolderEntry(NamedTuple):
@@ -129,10 +153,17 @@ def digitize_folder(
         raise ValueError("photos whose names differ only in the suffix would share a folder")
     for photo, folder in zip(photos, folders, strict=True):
         on_start(photo)
-        if (folder / "report.json").is_file():
+        fitted = (folder / "report.json").is_file()
+        unfinished = options.get("complete", False) and not (folder / "albedo.png").is_file()
+        if fitted and not unfinished:
             yield FolderEntry(photo, folder, None, None)
             continue
         try:
+            if fitted:
+                model = str(read_fit(folder / "fit.npz").metadata["model"])
+                _complete(folder, model, options.get("completion") or {}, lambda what, i, n: None)
+                yield FolderEntry(photo, folder, None, None)
+                continue
             yield FolderEntry(photo, folder, digitize(photo, folder, **options), None)
         except (ValueError, FileNotFoundError) as error:
             yield FolderEntry(photo, folder, None, str(error))
