@@ -9,7 +9,7 @@ import sys
 import time
 
 import torch
-import torch.nn.functional as F
+from torch.nn import functional
 
 BLOCKS = ((2, 64), (2, 128), (4, 256), (4, 512), (1, 512))
 
@@ -32,9 +32,11 @@ def main(side: int, calls: int) -> None:
         start = time.perf_counter(), time.process_time()
         x, loss = image, torch.zeros(())
         for index, block in enumerate(kernels):
-            x = F.avg_pool2d(x, 2) if index else x
+            x = functional.avg_pool2d(x, 2) if index else x
             for place, kernel in enumerate(block):
-                x = F.relu(F.conv2d(x, kernel, torch.zeros(kernel.shape[0]), padding=1))
+                x = functional.relu(
+                    functional.conv2d(x, kernel, torch.zeros(kernel.shape[0]), padding=1)
+                )
                 if place == 0:
                     flat = x.reshape(x.shape[1], -1)
                     loss = loss + ((flat @ flat.T / flat.shape[1] - 1) ** 2).sum()

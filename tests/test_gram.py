@@ -18,7 +18,7 @@ from jaxface.energies.gram import (
     style_energy,
     style_value_and_grad,
 )
-from jaxface.models.feature_tiles import tiling
+from jaxface.models.feature_tiles import LARGEST_TILE, even_tile, tiling
 from jaxface.models.features import FeatureNetwork, features
 from jaxface.models.random_features import random_network
 
@@ -123,6 +123,15 @@ def test_tiles_change_nothing(network, pooling, shape, tile, x64):
     tiled = grams_of(wide, image, LAYERS, tile)
     for layer, whole in grams_of(wide, image, LAYERS).items():
         np.testing.assert_allclose(tiled[layer], whole, rtol=1e-11, atol=1e-13)
+
+
+@given(height=st.integers(1, 9000), width=st.integers(1, 9000))
+def test_even_tiles_cover_with_little_overhang(height, width):
+    tile = even_tile((height, width))
+    count = -(-max(height, width) // tile)
+    assert tile % 16 == 0 and tile <= LARGEST_TILE
+    assert count == -(-max(height, width) // LARGEST_TILE)
+    assert count * tile - max(height, width) < 16 * count
 
 
 def test_tiles_in_single_precision():

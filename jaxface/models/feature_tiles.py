@@ -26,8 +26,17 @@ from jaxface.models.features import (
     with_indicator,
 )
 
-DEFAULT_TILE = 1024
-"""px; with VGG-19 to conv5_1 a tile of this size needs about 1.3 GB for loss and gradient"""
+LARGEST_TILE = 832
+"""px; with VGG-19 to conv5_1 a tile of this size takes about 1.6 GB for loss and gradient"""
+
+
+def even_tile(shape: tuple[int, int], largest: int = LARGEST_TILE) -> int:
+    """Side of the tiles, at most ``largest``, that cover an image (h, w) with the least overhang.
+
+    A multiple of 16, which suits every layer up to block 5.
+    """
+    count = -(-max(shape) // largest)
+    return -(-max(shape) // (16 * count)) * 16
 
 
 class Tiling(NamedTuple):
@@ -69,7 +78,7 @@ def sum_over_tiles(
     network: FeatureNetwork,
     image: Float[Array, "h w"],
     layers: Sequence[str] = STYLE_LAYERS,
-    tile: int = DEFAULT_TILE,
+    tile: int = LARGEST_TILE,
     method: str = "auto",
 ) -> PyTree:
     """The sum over tiles of a function of the tile's responses.
