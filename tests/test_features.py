@@ -42,8 +42,9 @@ def direct_sum(x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     """Correlation written out in NumPy."""
     height, width, _ = x.shape
     padded = np.pad(x, ((1, 1), (1, 1), (0, 0)))
-    return sum(
-        padded[i : i + height, j : j + width] @ kernel[i, j] for i in range(3) for j in range(3)
+    return np.sum(
+        [padded[i : i + height, j : j + width] @ kernel[i, j] for i in range(3) for j in range(3)],
+        axis=0,
     )
 
 
