@@ -166,3 +166,27 @@ def test_posterior_of_a_linear_gaussian_model(x64):
     expected = np.linalg.inv(np.eye(4) + np.asarray(a.T @ a) / sigma**2)
     found = posterior_covariance(curvature, 2 * weight)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-7)
+
+
+def test_answers_are_differentiable_in_the_weights_of_terms(x64):
+    """Weights that terms read from the data reach the answer by the implicit function theorem."""
+    goal = jnp.array([0.7, -0.4, 0.2])
+    energy = compose(
+        [
+            Term("data", lambda y, d: jnp.sin(y) - goal, lambda d: d["data"]),
+            Term("prior", lambda y, d: y, lambda d: d["prior"]),
+        ]
+    )
+
+    def solved(weights):
+        problem = Problem(energy.value, energy.quadratic)
+        return gauss_newton(problem, jnp.zeros(3), weights, steps=60, rtol=1e-15).value
+
+    at = {"data": jnp.asarray(2.0), "prior": jnp.asarray(0.3)}
+    forward, reverse = jax.jacfwd(solved)(at), jax.jacrev(solved)(at)
+    for name in at:
+        up, down = ({**at, name: at[name] + s} for s in (1e-5, -1e-5))
+        numeric = (solved(up) - solved(down)) / 2e-5
+        assert float(jnp.abs(numeric).min()) > 1e-3
+        np.testing.assert_allclose(forward[name], numeric, rtol=1e-6)
+        np.testing.assert_allclose(reverse[name], numeric, rtol=1e-6)

@@ -33,7 +33,8 @@ class Term(NamedTuple):
     Attributes:
         name: the key under which its value is reported.
         fn: ``fn(y, args)``; a pytree of residuals or a scalar, by ``kind``.
-        weight: non-negative factor.
+        weight: non-negative factor, or a function of ``args`` that gives it, so that a solver's
+            answer can be differentiated with respect to it.
         kind: ``"residual"`` or ``"scalar"``.
         quadratic: an optional faster ``(y, args) -> Quadratic`` of the *unweighted* term, used
             instead of automatic differentiation by Gauss-Newton solvers.
@@ -41,7 +42,7 @@ class Term(NamedTuple):
 
     name: str
     fn: Callable[[Any, Any], Any]
-    weight: float | Float[Array, ""] = 1.0
+    weight: float | Float[Array, ""] | Callable[[Any], Any] = 1.0
     kind: Literal["residual", "scalar"] = "residual"
     quadratic: Callable[[Any, Any], Quadratic] | None = None
 
@@ -50,7 +51,11 @@ class Term(NamedTuple):
         out = self.fn(y, args)
         if self.kind == "residual":
             out = sum_of_squares(out)
-        return self.weight * out
+        return self.weight_at(args) * out
+
+    def weight_at(self, args: PyTree) -> Any:
+        """The weight, for a problem's data."""
+        return self.weight(args) if callable(self.weight) else self.weight
 
 
 class Energy(NamedTuple):
@@ -80,19 +85,21 @@ class Energy(NamedTuple):
                 f"the energy is not a sum of squares: term(s) {scalar} are scalar; "
                 "give them as residuals or use a general minimiser"
             )
-        return {
-            term.name: jax.tree.map(
-                lambda r, w=term.weight: jnp.sqrt(jnp.asarray(w, r.dtype)) * r, term.fn(y, args)
+        def scaled(term: Term) -> PyTree:
+            weight = term.weight_at(args)
+            return jax.tree.map(
+                lambda r: jnp.sqrt(jnp.asarray(weight, r.dtype)) * r, term.fn(y, args)
             )
-            for term in self.terms
-        }
+
+        return {term.name: scaled(term) for term in self.terms}
 
     def quadratic(self, y: PyTree, args: PyTree) -> tuple[Quadratic, dict[str, Array]]:
         """The weighted sum of the terms' second-order models, and each term's weighted value."""
         parts, values = [], {}
         for term in self.terms:
             model = term.quadratic or quadratic_by_autodiff(term)
-            part = jax.tree.map(lambda x, w=term.weight: w * x, model(y, args))
+            weight = term.weight_at(args)
+            part = jax.tree.map(lambda x, w=weight: w * x, model(y, args))
             parts.append(part)
             values[term.name] = part.value
         return jax.tree.map(lambda *xs: sum(xs[1:], xs[0]), *parts), values

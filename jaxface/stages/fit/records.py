@@ -75,6 +75,8 @@ class FitData(eqx.Module):
     normal_modes: Float[Array, "n 3 k"]
     """derivative of the vertex normals along the shape modes, from the start of the level"""
     focal_prior: tuple[Array, Array]
+    weights: FitWeights
+    """of the terms"""
 
 
 class FitStats(eqx.Module):

@@ -5,7 +5,9 @@ light, by damped Gauss-Newton on iteratively reweighted least squares over an im
 rasteriser finds what is visible again before every step.
 """
 
+import operator
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -53,16 +55,26 @@ from jaxface.stages.fit.records import (
 )
 
 
-def fit_energy(weights: FitWeights, extra_terms: Sequence[Term] = ()) -> Energy:
-    """Equation 1 of Saito 2017 as composed terms of ``(FaceParameters, FitData)``."""
+def fit_energy(weights: FitWeights | None = None, extra_terms: Sequence[Term] = ()) -> Energy:
+    """Equation 1 of Saito 2017 as composed terms of ``(FaceParameters, FitData)``.
+
+    Args:
+        weights: of the terms; by default those in the data, with respect to which a fit can then
+            be differentiated.
+        extra_terms: your own.
+    """
     return compose(
         [
-            Term("photo", _photo_value, weights.photo, "scalar", _photo_quadratic),
+            Term("photo", _photo_value, _weight(weights, "photo"), "scalar", _photo_quadratic),
             *_geometric_terms(weights),
-            Term("light", lambda y, d: light_residual(y), weights.light),
+            Term("light", lambda y, d: light_residual(y), _weight(weights, "light")),
             *extra_terms,
         ]
     )
+
+
+def _weight(weights: FitWeights | None, name: str) -> Any:
+    return operator.attrgetter(f"weights.{name}") if weights is None else getattr(weights, name)
 
 
 def _photo_value(y: FaceParameters, data: FitData) -> Float[Array, ""]:
@@ -74,11 +86,16 @@ def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
     return jax.tree.map(lambda x: data.photo_trust * x, model)
 
 
-def _geometric_terms(weights: FitWeights) -> list[Term]:
+def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
+    def focal(y: FaceParameters, d: FitData) -> Array:
+        return focal_residual(y, d.focal_prior)
+
     return [
-        Term("landmark", lambda y, d: landmark_residual(y, d.landmark), weights.landmark),
-        Term("prior", lambda y, d: prior_residual(y), weights.prior),
-        Term("focal", lambda y, d: focal_residual(y, d.focal_prior), weights.focal),
+        Term(
+            "landmark", lambda y, d: landmark_residual(y, d.landmark), _weight(weights, "landmark")
+        ),
+        Term("prior", lambda y, d: prior_residual(y), _weight(weights, "prior")),
+        Term("focal", focal, _weight(weights, "focal")),
     ]
 
 
@@ -125,7 +142,7 @@ def fit_level(
     level: int,
 ) -> tuple[FaceParameters, LevelRecord]:
     """One pyramid level (0 is the coarsest) from the parameters of the last."""
-    energy = fit_energy(weights, config.extra_terms)
+    energy = fit_energy(None, config.extra_terms)
     problem = Problem(
         energy=energy.value,
         quadratic=energy.quadratic,
@@ -190,6 +207,7 @@ def observe(
         landmark=eqx.tree_at(lambda d: d.weight, landmark, robust),
         normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
+        weights=weights,
     )
 
 
@@ -231,18 +249,19 @@ def fit_landmarks(
         data.principal,
     )
     y = eqx.tree_at(lambda p: (p.rotation, p.translation), y, (rotation, translation))
-    energy = compose(_geometric_terms(weights))
+    energy = compose(_geometric_terms())
 
     def refresh(y, args):
-        data, model = args
+        data, model, weights = args
         return _GeometricData(
             slide_contour(y, landmark_data(data, model), model.contour, model.outline),
             (data.log_focal, data.log_focal_deviation),
+            weights,
         )
 
     problem = Problem(energy.value, energy.quadratic, refresh)
     solution = gauss_newton(
-        problem, y, (data, model), steps=config.landmark_steps, rtol=config.rtol
+        problem, y, (data, model, weights), steps=config.landmark_steps, rtol=config.rtol
     )
     return solution.value, _record(solution)
 
@@ -250,6 +269,7 @@ def fit_landmarks(
 class _GeometricData(eqx.Module):
     landmark: LandmarkData
     focal_prior: tuple[Array, Array]
+    weights: FitWeights
 
 
 def initial_light(
