@@ -18,7 +18,7 @@ def lips(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Dens
     inside = smoothstep(patch.regions.lips + ragged, 0.25, 0.85)
     # Grooves fan out towards the corners; along themselves they vary five times more slowly.
     fan = x * (1.0 - 0.012 * jnp.abs(y - middle[1]))
-    warp = 0.32 * gradient_noise(patch.position, 5.0, layer_seed(seed, 111))
+    warp = 0.18 * gradient_noise(patch.position, 5.0, layer_seed(seed, 111))
     grain = (fan + warp, 0.2 * y, 0.2 * z)
 
     def grooves(wave: float, layer: int) -> Row:

@@ -13,7 +13,7 @@ from jaxface.imaging.colour import LUMINANCE
 from jaxface.models.morphable import MorphableModel
 
 NOT_SKIN = ("eyes", "mouth_interior")
-RIM_RINGS = 3
+RIM_RINGS = 5
 """rings of vertices inside the mouth that are lip"""
 
 
