@@ -119,6 +119,47 @@ def database_synth(
     console.print(f"{len(made)} skins in [bold]{out}[/bold]")
 
 
+@database_app.command("import-skins")
+def database_import_skins(
+    skins: Annotated[list[Path], typer.Argument(help="Textures painted for MakeHuman's UVs.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the database.")],
+    resolution: Annotated[int, typer.Option("--resolution", help="Texels along a side.")] = 1024,
+    licence: Annotated[str, typer.Option("--licence", help="Of the skins.")] = "CC0-1.0",
+) -> None:
+    """Bring MakeHuman skins into the default model's UVs."""
+    from jaxface.pipeline.texture_import import import_skins
+
+    with errors(), steps(f"skins in {out}") as on_step:
+        made: Any = import_skins(
+            skins, out, resolution, licence=licence,
+            on_progress=lambda done, of: on_step("skins", done, of),
+        )  # fmt: skip
+    console.print(f"{len(made)} textures in [bold]{out}[/bold]")
+
+
+@database_app.command("import-scan")
+def database_import_scan(
+    mesh: Annotated[Path, typer.Argument(help="OBJ of a head, with texture coordinates.")],
+    albedo: Annotated[Path, typer.Argument(help="Its colour map.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the database.")],
+    licence: Annotated[str, typer.Option("--licence", help="Of the scan, with its credit.")],
+    subject: Annotated[str | None, typer.Option("--subject", help="Name in the database.")] = None,
+    landmarks: Annotated[
+        Path | None, typer.Option("--landmarks", help="Points on the scan; detected if not given.")
+    ] = None,
+    resolution: Annotated[int, typer.Option("--resolution", help="Texels along a side.")] = 1024,
+) -> None:
+    """Register a head scan to the default topology and add its albedo to a database."""
+    from jaxface.pipeline.scan_import import import_scan
+
+    with errors(), steps(str(mesh)) as on_step:
+        import_scan(
+            mesh, albedo, out, resolution, subject=subject or mesh.stem, licence=licence,
+            landmarks=landmarks, on_progress=lambda done, of: on_step("registration", done, of),
+        )  # fmt: skip
+    console.print(f"wrote [bold]{out}[/bold]")
+
+
 @features_app.command("info")
 def features_info(
     source: Annotated[str, typer.Argument(help="random, trained, vgg16, vgg19, or a file.")],

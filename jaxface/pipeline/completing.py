@@ -120,17 +120,16 @@ def complete(
     order = np.argsort(-blended.weights)
     used = [int(i) for i in order if blended.weights[i] > 1e-3]
     records: list[dict[str, Any]] = []
-    start, last = np.zeros(0), None
+    start = work.start(work.levels[0], used[0])
+    last = Level(np.zeros((0, 0), np.float32), {}, {})
     for index, level in enumerate(work.levels):
         start = work.start(level, used[0])
         done = resumed(level)
         if done is None or done.image.shape != work.cut(start, level).shape[:2]:
-            coarser = None if last is None else last.image
-            done = work.synthesise(level, start, coarser, blended, used, index)
+            done = work.synthesise(level, start, last.image, blended, used, index)
             finished(level, done)
         records.append(done.record)
         last = done
-    assert last is not None
     return Completed(
         work.compose(start, last.image),
         start,
@@ -262,14 +261,14 @@ class _Work:
         self,
         level: int,
         start: Float[np.ndarray, "r r 3"],
-        coarser: Float[np.ndarray, "h w"] | None,
+        coarser: Float[np.ndarray, "h w"],
         blended: Blend,
         used: list[int],
         index: int,
     ) -> Level:
         """Section 5 at one level, from the coarser level's result with the start's finer detail."""
         first = self.cut(rgb_to_yiq(jnp.asarray(start))[..., 0], level)
-        if coarser is not None:
+        if coarser.size:
             lower = resize(first[..., None], *coarser.shape)
             first = first + resize(jnp.asarray(coarser)[..., None] - lower, *first.shape)[..., 0]
         free = self.cut(self.mask(level), level)

@@ -122,12 +122,10 @@ def synthesise(
         return energy.value(_intensity(z), problem)[0]
 
     def watch(step: int, state: LBFGSState) -> bool | None:
-        assert on_step is not None
-
         def image() -> Array:
             return jnp.where(problem.free, _intensity(state.y.reshape(start.shape)), start)
 
-        return on_step(step, float(state.value), image)
+        return None if on_step is None else on_step(step, float(state.value), image)
 
     first = jnp.arctanh(2 * jnp.clip(start, 0.004, 0.996) - 1)
     hooks: dict[str, Any] = {}
