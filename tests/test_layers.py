@@ -54,6 +54,10 @@ RESTRICTED = {
     "bpy": set(),
     "eos": set(),
     "cvxpy": set(),
+    "piqp": set(),
+    "highspy": set(),
+    "clarabel": set(),
+    "scs": set(),
     "trimesh": set(),
     "matplotlib": set(),
 }

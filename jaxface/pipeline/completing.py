@@ -40,6 +40,9 @@ LARGEST_WHOLE = 1 << 20
 Progress = Callable[[str, int, int, Callable[[], Float[np.ndarray, "h w 3"]] | None], None]
 """``(what, done, of, picture)``: a picture of the work so far where there is one"""
 
+Blending = Callable[..., Blend]
+"""``(database, target, norm=...)``, as `stages.blend.blend`"""
+
 
 @dataclass(frozen=True)
 class CompletionSettings:
@@ -91,6 +94,7 @@ def complete(
     network: FeatureNetwork,
     settings: CompletionSettings | None = None,
     *,
+    blending: Blending = blend,
     on_progress: Progress = lambda what, done, of, picture: None,
     resumed: Callable[[int], "Level | None"] = lambda level: None,
     finished: Callable[[int, "Level"], None] = lambda level, done: None,
@@ -105,6 +109,8 @@ def complete(
         database: textures in the same UVs.
         network: extractor of features.
         settings: see `CompletionSettings`.
+        blending: how statistics are blended, of the arguments of `stages.blend.blend`; for
+            instance ``nearest_subject``.
         on_progress: told of every step.
         resumed: a level (texels along a side) that an earlier run has finished.
         finished: told of every finished level.
@@ -115,10 +121,10 @@ def complete(
     settings = settings or CompletionSettings()
     if len(database) < 2:
         raise ValueError(f"database {database.name!r} has {len(database)} subjects; 2 are needed")
-    work = _Work(seen, database, network, settings, on_progress)
+    work = _Work(seen, database, network, settings, on_progress, blending)
     blended = work.blend()
     order = np.argsort(-blended.weights)
-    used = [int(i) for i in order if blended.weights[i] > 1e-3]
+    used = [int(i) for i in order if abs(blended.weights[i]) > 1e-3]
     records: list[dict[str, Any]] = []
     start = work.start(work.levels[0], used[0])
     last = Level(np.zeros((0, 0), np.float32), {}, {})
@@ -166,9 +172,10 @@ class _Work:
         network: FeatureNetwork,
         settings: CompletionSettings,
         on_progress: Progress,
+        blending: Blending,
     ) -> None:
         self.seen, self.database, self.network = seen, database, network
-        self.settings, self.on_progress = settings, on_progress
+        self.settings, self.on_progress, self.blending = settings, on_progress, blending
         self.levels = [seen.resolution]
         while self.levels[0] >= 2 * COARSEST and self.levels[0] % 2 == 0:
             self.levels.insert(0, self.levels[0] // 2)
@@ -235,11 +242,12 @@ class _Work:
             self.on_progress("analysis", index + 1, count, None)
         columns = {name: np.stack(values) for name, values in stacks.items()}
         goal = {name: np.asarray(value) for name, value in target.items()}
-        return blend(columns, goal, norm=self.settings.norm)  # pyright: ignore[reportArgumentType]
+        return self.blending(columns, goal, norm=self.settings.norm)
 
     def targets(self, level: int, blended: Blend, used: list[int]) -> dict[str, Array]:
         """The complete Gram matrices ``sum_k w_k G(I_k)``."""
-        weights = blended.weights[used] / blended.weights[used].sum()
+        # What was left out is made up for, so that the sum of the weights stays as it was.
+        weights = blended.weights[used] * (blended.weights.sum() / blended.weights[used].sum())
         total: dict[str, Array] = {}
         for share, index in zip(weights, used, strict=True):
             found = self.statistics(self.subject(index, level), self.mask(level), level)

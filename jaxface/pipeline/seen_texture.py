@@ -131,6 +131,9 @@ def read_seen_texture(
         ValueError: a file is damaged, or of another model.
     """
     place = Path(folder)
+    for name in ("fit.npz", "albedo_partial.exr"):
+        if not (place / name).is_file():
+            raise FileNotFoundError(f"{place} has no {name}; `jaxface digitize` writes it")
     saved = read_fit(place / "fit.npz")
     name = str(saved.metadata.get("model"))
     if model is None and name not in bundled_models():

@@ -1,0 +1,207 @@
+"""Completing an albedo, from a partial one to files, with small networks and maps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxface.geometry.uv import uv_layout
+from jaxface.io.gltf import write_glb
+from jaxface.io.models import load_model
+from jaxface.io.retexture import retexture_glb, retexture_obj
+from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.random_features import random_network
+from jaxface.pipeline.completing import CompletionSettings, complete, level_steps, shrink
+from jaxface.pipeline.completion_files import open_database, parse_settings
+from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
+
+SIZE = 256
+LAYERS = ("conv1_1", "conv2_1", "conv3_1")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model("makehuman")
+
+
+@pytest.fixture(scope="module")
+def base(model):
+    layout = uv_layout(model.uv, model.uv_faces, SIZE)
+    return np.asarray(layout(model.albedo_mean, model.faces, fill=0.3)).clip(0.02, 0.9)
+
+
+def speckled(base, strength, seed):
+    rng = np.random.default_rng(seed)
+    return base * (1 - strength * (rng.uniform(size=(SIZE, SIZE, 1)) > 0.8))
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory, model, base):
+    made = TextureDatabase.create(
+        tmp_path_factory.mktemp("db"), model, SIZE, name="speckles", licence="CC0-1.0"
+    )
+    for index, strength in enumerate((0.02, 0.15, 0.3)):
+        made.write_subject(f"s{index}", speckled(base, strength, index))
+    return made
+
+
+@pytest.fixture(scope="module")
+def seen(model, base):
+    """The left half of a face with speckles of the middle strength."""
+    weight = np.zeros((SIZE, SIZE), np.float32)
+    weight[:, : SIZE // 2] = 1
+    coefficients = np.zeros(model.albedo.count, np.float32)
+    return seen_texture(model, speckled(base, 0.15, 9), weight, coefficients, 1.0)
+
+
+@pytest.fixture(scope="module")
+def network():
+    return random_network(((1, 8), (1, 16), (1, 16)), seed=1)
+
+
+SETTINGS = CompletionSettings(iterations=12, layers=LAYERS)
+
+
+@pytest.fixture(scope="module")
+def completed(seen, database, network):
+    told = []
+    done = complete(
+        seen, database, network, SETTINGS,
+        on_progress=lambda what, i, n, picture: told.append((what, i, n)),
+    )  # fmt: skip
+    return done, told
+
+
+def test_the_right_subject_is_found(completed):
+    weights = completed[0].blended.weights
+    assert weights.sum() == pytest.approx(1, abs=1e-5)
+    assert weights.argmax() == 1
+    assert float(completed[0].blended.relative_gap) < 1e-6
+
+
+def test_progress_is_told(completed):
+    _, told = completed
+    assert ("analysis", 3, 3) in told
+    assert any(what == "synthesis at 256" for what, _, _ in told)
+
+
+def test_the_unseen_half_gets_detail_and_the_seen_one_keeps_its_own(completed, seen):
+    albedo, free = completed[0].albedo, seen.free
+
+    def grain(texture, where):
+        fine = texture.mean(-1) - np.roll(texture.mean(-1), 1, axis=0)
+        return fine[where].std()
+
+    left, right = free.copy(), free.copy()
+    left[:, SIZE // 2 :] = False
+    right[:, : SIZE // 2] = False
+    assert grain(albedo, right) > 2 * grain(seen.low_frequency, right)
+    assert 0.5 < grain(albedo, right) / grain(seen.photo, left) < 2
+    assert np.abs(albedo[left] - seen.photo[left]).mean() < 0.03
+    assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1
+
+
+def test_eyes_and_mouth_are_left_alone(completed, seen):
+    apart = seen.inside & ~seen.skin
+    assert apart.sum() > 100
+    np.testing.assert_allclose(completed[0].albedo[apart], seen.low_frequency[apart], atol=0.02)
+
+
+def test_finished_levels_are_not_made_again(seen, database, network):
+    kept = {}
+    first = complete(seen, database, network, SETTINGS, finished=kept.__setitem__)
+    again = complete(seen, database, network, SETTINGS, resumed=kept.get)
+    np.testing.assert_allclose(again.albedo, first.albedo, atol=1e-6)
+    assert again.levels == first.levels
+
+
+def test_detail_can_be_kept_out_of_a_region(seen, completed, database, network):
+    settings = dataclasses.replace(
+        SETTINGS, detail={"forehead": 0.0}, start="low_frequency", match_complexion=False
+    )
+    plain = complete(seen, database, network, settings).albedo
+    forehead = seen.detail_map({"forehead": 0.0}) == 0
+    forehead &= seen.free
+    forehead[:, : SIZE // 2 + 8] = False
+    change = np.abs(plain - seen.low_frequency).mean(-1)
+    other = seen.free & (seen.detail_map({"forehead": 0.0}) == 1)
+    other[:, : SIZE // 2 + 8] = False
+    assert change[forehead].mean() < 0.5 * change[other].mean()
+
+
+def test_wrong_input_is_named(seen, database, network, model, tmp_path):
+    lone = TextureDatabase.create(tmp_path / "lone", model, SIZE, name="one", licence="x")
+    with pytest.raises(ValueError, match="0 subjects; 2 are needed"):
+        complete(seen, lone, network, SETTINGS)
+    blind = dataclasses.replace(seen, weight=np.zeros_like(seen.weight))
+    with pytest.raises(ValueError, match="no skin"):
+        complete(blind, database, network, SETTINGS)
+    with pytest.raises(ValueError, match="no region 'beak'"):
+        seen.detail_map({"beak": 1.0})
+    with pytest.raises(ValueError, match="square"):
+        seen_texture(model, np.zeros((300, 200, 3)), np.zeros((300, 200)), np.zeros(11), 1.0)
+    with pytest.raises(FileNotFoundError, match="jaxface digitize"):
+        read_seen_texture(tmp_path)
+    with pytest.raises(ValueError, match="name a database"):
+        open_database(None, "other.npz", SIZE)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"norm": "max"}, "norm is"),
+        ({"iterations": 0}, "at least one"),
+        ({"alpha": -1.0}, "weights of 0 or more"),
+        ({"start": "noise"}, "start is"),
+        ({"detail": "lips"}, "region=value"),
+        ({"photo": -1.0}, "weights of 0 or more"),
+    ],
+)
+def test_settings_are_checked(given, message):
+    with pytest.raises(ValueError, match=message):
+        parse_settings(**given)
+
+
+def test_settings_from_a_command_line():
+    settings = parse_settings(detail="lips=0.5, nose=0", photo=3.0, iterations=7)
+    assert settings.detail == {"lips": 0.5, "nose": 0.0}
+    assert settings.weights.photo == 3.0 and settings.iterations == 7
+
+
+def test_steps_halve_and_sum():
+    assert level_steps(700, 3) == [400, 200, 100]
+    assert min(level_steps(1, 4)) == 1
+
+
+def test_shrink_averages_blocks():
+    texture = np.arange(16.0).reshape(4, 4, 1)
+    np.testing.assert_allclose(shrink(texture, 2)[..., 0], [[2.5, 4.5], [10.5, 12.5]])
+    assert shrink(texture, 8).shape == (4, 4, 1)
+
+
+def test_another_texture_for_a_mesh_on_disk(tmp_path, model):
+    from PIL import Image
+
+    for name, colour in (("old", 10), ("new", 200)):
+        Image.fromarray(np.full((8, 8, 3), colour, np.uint8)).save(tmp_path / f"{name}.png")
+    old, new = ((tmp_path / f"{name}.png").read_bytes() for name in ("old", "new"))
+    vertices = np.eye(3)
+    faces = np.array([[0, 1, 2]])
+    write_glb(
+        tmp_path / "m.glb", vertices, faces, uv=np.eye(3)[:, :2], uv_faces=faces, texture=old,
+        morphs={"a": np.ones((3, 3))}, weights={"a": 0.2},
+    )  # fmt: skip
+    before = (tmp_path / "m.glb").read_bytes()
+    retexture_glb(tmp_path / "m.glb", new + b"\0" * 7)
+    after = (tmp_path / "m.glb").read_bytes()
+    assert old in before and old not in after and new in after
+    retexture_glb(tmp_path / "m.glb", old)
+    assert len((tmp_path / "m.glb").read_bytes()) == len(before)
+    (tmp_path / "m.mtl").write_text("newmtl skin\nmap_Kd texture.png\n")
+    retexture_obj(tmp_path / "m.obj", "albedo.png")
+    assert "map_Kd albedo.png" in (tmp_path / "m.mtl").read_text()
+    (tmp_path / "bad.glb").write_bytes(b"glTF")
+    with pytest.raises(ValueError, match="not a readable GLB"):
+        retexture_glb(tmp_path / "bad.glb", new)
+    with pytest.raises(FileNotFoundError):
+        retexture_glb(tmp_path / "none.glb", new)
