@@ -1,0 +1,363 @@
+"""Gram matrices of a masked texture without running the network on all of it again.
+
+G^l(M(I)) of section 4 of Saito 2017 for many textures I and one mask M. The responses that enter
+it are of three kinds (see `mask_reach`): those that see visible pixels only are as in the whole
+texture, and their products are cached as sums over square cells of each layer's map; those that
+see masked pixels only are the same for every texture; those that see both are computed again,
+tile by tile, from what is cached of each pooling's result.
+
+Cached maps are half precision, each scaled by its largest value; cells have a scale each. That
+changes a Gram matrix by about 1e-5 of its Frobenius norm; everything else is float rounding.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxface._types import Array, Bool, Float
+from jaxface.energies.gram import MASKED
+from jaxface.models.conv3x3 import conv3x3_relu
+from jaxface.models.features import (
+    STYLE_LAYERS,
+    FeatureNetwork,
+    blocks_up_to,
+    layer_position,
+    pool,
+    with_indicator,
+)
+from jaxface.models.mask_reach import Plan, blank_place, plan, whole_cells
+from jaxface.models.winograd_tiles import TILES_AT_ONCE, convolve_tiles, transformed_kernel
+
+Stored = Mapping[str, np.ndarray]
+"""what is cached of a texture, by the names of `layout`"""
+
+_SMALLEST_CELLED = 192
+"""px; of smaller maps the responses themselves are cached"""
+
+
+class Layout(NamedTuple):
+    """What is cached of a texture of one shape: shape and type of each array."""
+
+    shapes: dict[str, tuple[int, ...]]
+    types: dict[str, str]
+    cells: dict[str, int]
+    """of each layer, side of its cells in pixels of its map; 0: its responses are cached"""
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of one texture."""
+        return sum(
+            math.prod(shape) * np.dtype(self.types[name]).itemsize
+            for name, shape in self.shapes.items()
+        )
+
+
+def layout(
+    network: FeatureNetwork,
+    shape: tuple[int, int],
+    layers: Sequence[str] = STYLE_LAYERS,
+    cells: Mapping[str, int] | None = None,
+) -> Layout:
+    """What has to be cached of a texture.
+
+    Args:
+        network: the extractor.
+        shape: height and width of the textures.
+        layers: those whose Gram matrices are wanted.
+        cells: by layer, side of its cells (px of its map), 0 to cache responses; by default the
+            smallest power of two, from 16, whose sums take little memory beside the responses.
+
+    Raises:
+        ValueError: a layer is unknown, or its map would be empty.
+    """
+    blocks = blocks_up_to(network, layers)
+    if min(shape) >> (len(blocks) - 1) == 0:
+        raise ValueError(f"a texture of {shape[0]}x{shape[1]} pixels has no {blocks[-1][-1]}")
+    shapes: dict[str, tuple[int, ...]] = {"image": shape}
+    types = {"image": "<f4"}
+    chosen: dict[str, int] = {}
+    for index, block in enumerate(blocks):
+        height, width = shape[0] >> index, shape[1] >> index
+        if index:
+            channels = network.channels[blocks[index - 1][-1]]
+            shapes[f"pool{index}"] = (height * width, channels)
+        for name in (name for name in block if name in layers):
+            n = network.channels[name]
+            cell = 16
+            while cell**2 < 2 * n:
+                cell *= 2
+            cell = cell if min(height, width) >= _SMALLEST_CELLED else 0
+            cell = chosen[name] = cell if cells is None else cells.get(name, cell)
+            if cell:
+                count = -(-height // cell) * -(-width // cell)
+                shapes[f"{name}/cells"] = (count, n * (n + 1) // 2)
+            else:
+                shapes[name] = (height * width, n)
+    for name in list(shapes)[1:]:
+        types[name], types[f"{name}/scale"] = "<f2", "<f4"
+        shapes[f"{name}/scale"] = (shapes[name][0] if name.endswith("cells") else 1,)
+    return Layout(shapes, types, {name: chosen[name] for name in layers})
+
+
+def store(
+    network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout
+) -> dict[str, Array]:
+    """What is cached of a texture, in single precision; `compressed` halves it. May be jitted.
+
+    Args:
+        network: the extractor.
+        image: intensity in [0, 1], whole.
+        layout: as `layout` makes it for this network and shape.
+    """
+    found: dict[str, Array] = {"image": image}
+    x = with_indicator(image)
+    for index, block in enumerate(blocks_up_to(network, layout.cells)):
+        if index:
+            x = pool(x, network.pooling)
+            found[f"pool{index}"] = x.reshape(-1, x.shape[-1])
+        for name in block:
+            x = conv3x3_relu(x, network.kernels[name], network.biases[name])
+            if name not in layout.cells:
+                continue
+            if layout.cells[name]:
+                found[f"{name}/cells"] = _cell_sums(x, layout.cells[name])
+            else:
+                found[name] = x.reshape(-1, x.shape[-1])
+    return found
+
+
+def compressed(found: Mapping[str, Array], layout: Layout) -> dict[str, np.ndarray]:
+    """The arrays that go to disk: half precision with scales."""
+    stored: dict[str, np.ndarray] = {}
+    for name, value in found.items():
+        array = np.asarray(value, np.float32)
+        if layout.types[name] == "<f2":
+            axis = 1 if name.endswith("cells") else (0, 1)
+            scale = np.maximum(np.abs(array).max(axis=axis, keepdims=True), 1e-30)
+            stored[f"{name}/scale"] = scale.reshape(-1).astype("<f4")
+            array = array / scale
+        stored[name] = np.ascontiguousarray(array, layout.types[name])
+    return stored
+
+
+def _cell_sums(x: Float[Array, "h w n"], cell: int) -> Float[Array, "c m"]:
+    """Upper triangles of ``sum F F^T`` over square cells."""
+    height, width, n = x.shape
+    x = jnp.pad(x, ((0, -height % cell), (0, -width % cell), (0, 0)))
+    rows, columns = x.shape[0] // cell, x.shape[1] // cell
+    upper = np.triu_indices(n)
+
+    def of_row(strip: Array) -> Array:
+        parts = strip.reshape(cell, columns, cell, n)
+        return jnp.einsum("ycxi,ycxj->cij", parts, parts)[:, upper[0], upper[1]]
+
+    sums = lax.map(of_row, x.reshape(rows, cell, columns * cell, n))
+    return sums.reshape(rows * columns, -1)
+
+
+class _Layer(NamedTuple):
+    """A layer's weights as the tiles need them."""
+
+    kernel: Array | np.ndarray
+    bias: np.ndarray
+    tiled: bool
+
+
+class Prepared(NamedTuple):
+    """What a mask asks for of every texture, and its part that is the same for all of them."""
+
+    shape: tuple[int, int]
+    blocks: tuple[tuple[str, ...], ...]
+    pooling: str
+    layout: Layout
+    plan: Plan
+    layers: dict[str, _Layer]
+    blank: tuple[np.ndarray, ...]
+    """by block: rows of the constant image at the places of the block's splice"""
+    constant: dict[str, Float[np.ndarray, "n n"]]
+    """sums over the masked part"""
+    clear: dict[str, np.ndarray]
+    """whole cells, or pixels where responses are cached"""
+
+
+def prepare(
+    network: FeatureNetwork,
+    visible: Bool[np.ndarray, "h w"],
+    layout: Layout,
+    unwidened: Sequence[str] = (),
+) -> Prepared:
+    """Prepare a mask: about a second once, for any number of textures.
+
+    Args:
+        network: the extractor.
+        visible: pixels to keep; the others become 0.5.
+        layout: of the cached textures.
+        unwidened: layers that are taken not to widen the band of mixed responses. Far from the
+            outline a receptive field sees the other side through its faint rim only, so the
+            band can be kept narrower than it exactly is; none by default, which is exact.
+
+    Raises:
+        ValueError: the mask is not of the textures' shape.
+    """
+    visible = np.asarray(visible, bool)
+    if visible.shape != layout.shapes["image"]:
+        raise ValueError(
+            f"the mask has shape {visible.shape}; the cached textures have "
+            f"{layout.shapes['image']}"
+        )
+    blocks = tuple(blocks_up_to(network, layout.cells))
+    tiled = {name: network.kernels[name].shape[2] > 4 for block in blocks for name in block}
+    small = tuple(_blank_side(side, blocks) for side in visible.shape)
+    kept = {name: False for name in unwidened}
+    work = plan(blocks, visible, layout.cells, tiled, small, kept)
+    maps = _blank_maps(network, small, blocks)
+    constant, clear = {}, {}
+    for name, reach in work.reaches.items():
+        index = layer_position(name)[0] - 1
+        short = (small[0] >> index, small[1] >> index)
+        places = blank_place(np.flatnonzero(reach.blank), reach.blank.shape, short)
+        times = np.bincount(places, minlength=short[0] * short[1])
+        present = np.flatnonzero(times)
+        rows = maps[name][present]
+        constant[name] = (rows * times[present, None].astype(np.float32)).T @ rows
+        cell = layout.cells[name]
+        clear[name] = np.flatnonzero(whole_cells(reach.clear, cell) if cell else reach.clear)
+    weights = {
+        name: _Layer(
+            transformed_kernel(network.kernels[name])
+            if tiled[name]
+            else np.asarray(network.kernels[name]).reshape(-1, network.channels[name]),
+            np.asarray(network.biases[name]),
+            tiled[name],
+        )
+        for name in work.works
+    }
+    blank = tuple(
+        maps[f"pool{index}"][splice.blank] for index, splice in enumerate(work.splices)
+    )
+    return Prepared(
+        visible.shape, blocks, network.pooling, layout, work, weights, blank, constant, clear
+    )
+
+
+def _blank_side(side: int, blocks: Sequence[Sequence[str]]) -> int:
+    """Side of a small constant image whose border region is that of a large one."""
+    reach = sum((len(block) + 1) << index for index, block in enumerate(blocks))
+    pixel = 1 << len(blocks)
+    return min(side, -(-2 * reach // pixel) * pixel + 2 * pixel + side % pixel)
+
+
+def _blank_maps(
+    network: FeatureNetwork, shape: tuple[int, int], blocks: Sequence[Sequence[str]]
+) -> dict[str, Float[np.ndarray, "p n"]]:
+    """All responses to a constant image, and each block's input as ``poolB``."""
+
+    @jax.jit
+    def maps(network: FeatureNetwork) -> dict[str, Array]:
+        x = with_indicator(jnp.full(shape, MASKED, jnp.float32))
+        found = {}
+        for index, block in enumerate(blocks):
+            x = pool(x, network.pooling) if index else x
+            found[f"pool{index}"] = x
+            for name in block:
+                x = found[name] = conv3x3_relu(x, network.kernels[name], network.biases[name])
+        return {name: value.reshape(-1, value.shape[-1]) for name, value in found.items()}
+
+    return {name: np.asarray(value) for name, value in maps(network).items()}
+
+
+def masked_grams_of(prepared: Prepared, stored: Stored) -> dict[str, Float[np.ndarray, "n n"]]:
+    """Gram matrices of one cached texture behind the prepared mask, by layer.
+
+    Args:
+        prepared: the mask's.
+        stored: the texture's arrays; those on disk are read only where they are needed.
+    """
+    found: dict[str, np.ndarray] = {}
+    rows = np.zeros((1, 1), np.float32)
+    for index, block in enumerate(prepared.blocks):
+        rows = _spliced(prepared, stored, index, rows)
+        for name in block:
+            work = prepared.plan.works[name]
+            rows = _convolved(prepared.layers[name], rows, work.sources)
+            if name in prepared.constant:
+                counted = rows[work.counted]
+                total = prepared.constant[name] + counted.T @ counted
+                total += _clear_sum(prepared, stored, name)
+                pixels = (prepared.shape[0] >> index) * (prepared.shape[1] >> index)
+                found[name] = total / pixels
+    return {name: found[name] for name in prepared.layout.cells}
+
+
+def _spliced(
+    prepared: Prepared, stored: Stored, index: int, before: Float[np.ndarray, "r n"]
+) -> Float[np.ndarray, "q m"]:
+    """Table of a block's input."""
+    splice, blank = prepared.plan.splices[index], prepared.blank[index]
+    a, b, c = len(splice.blank), len(splice.cached), splice.fresh.shape[1]
+    table = np.empty((1 + a + b + c, blank.shape[1]), np.float32)
+    table[0] = 0
+    table[1 : 1 + a] = blank
+    part = table[1 + a : 1 + a + b]
+    if index == 0:
+        part[:, 0] = stored["image"].reshape(-1)[splice.cached]
+        part[:, 1] = 1
+        return table
+    np.multiply(
+        stored[f"pool{index}"][splice.cached], stored[f"pool{index}/scale"], out=part,
+        dtype=np.float32,
+    )
+    if c:
+        part = table[1 + a + b :]
+        corners = [before[corner] for corner in splice.fresh]
+        if prepared.pooling == "max":
+            np.maximum(np.maximum(*corners[:2]), np.maximum(*corners[2:]), out=part)
+        else:
+            np.add(corners[0] + corners[1], corners[2] + corners[3], out=part)
+            part *= 0.25
+    return table
+
+
+def _convolved(
+    layer: _Layer, rows: Float[np.ndarray, "q i"], sources: np.ndarray
+) -> Float[np.ndarray, "r o"]:
+    """Table of a layer from that of its input."""
+    count = sources.shape[1]
+    outputs = layer.bias.shape[0]
+    if not layer.tiled:
+        table = np.zeros((1 + count, outputs), np.float32)
+        patches = rows[sources.T].reshape(count, -1)
+        np.matmul(patches, layer.kernel, out=table[1:])
+        table[1:] += layer.bias
+        np.maximum(table[1:], 0, out=table[1:])
+        return table
+    table = np.empty((1 + 16 * count, outputs), np.float32)
+    table[0] = 0
+    tiles = table[1:].reshape(16, count, outputs)
+    patches = np.zeros((36, TILES_AT_ONCE, rows.shape[1]), np.float32)
+    for start in range(0, count, TILES_AT_ONCE):
+        part = sources[:, start : start + TILES_AT_ONCE]
+        size = part.shape[1]
+        patches[:, :size] = rows[part]
+        result = convolve_tiles(patches, layer.kernel, layer.bias)
+        tiles[:, start : start + size] = np.asarray(result)[:, :size]
+    return table
+
+
+def _clear_sum(prepared: Prepared, stored: Stored, name: str) -> Float[np.ndarray, "n n"]:
+    """Sum over the pixels that are as in the whole texture and are not computed again."""
+    clear = prepared.clear[name]
+    n = len(prepared.constant[name])
+    if not prepared.layout.cells[name]:
+        rows = stored[name][clear].astype(np.float32)
+        return rows.T @ rows * stored[f"{name}/scale"][0] ** 2
+    sums = stored[f"{name}/cells"][clear].astype(np.float32)
+    packed = stored[f"{name}/cells/scale"][clear] @ sums
+    total = np.zeros((n, n), np.float32)
+    total[np.triu_indices(n)] = packed
+    return total + np.triu(total, 1).T
