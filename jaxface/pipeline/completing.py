@@ -15,6 +15,7 @@ from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.imaging.push_pull import push_pull
 from jaxface.imaging.resample import resize
 from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.feature_tiles import even_tile
 from jaxface.models.features import FeatureNetwork
 from jaxface.pipeline.seen_texture import SeenTexture
 from jaxface.stages.blend import Blend, blend
@@ -35,7 +36,7 @@ PHOTO_BLUR = 0.6
 """standard deviation of the low-pass that passes what a photo holds, in its pixels"""
 
 LARGEST_WHOLE = 1 << 20
-"""texels up to which statistics are taken in one piece; beyond, in tiles of 1024"""
+"""texels up to which statistics are taken in one piece; beyond, in tiles"""
 
 Progress = Callable[[str, int, int, Callable[[], Float[np.ndarray, "h w 3"]] | None], None]
 """``(what, done, of, picture)``: a picture of the work so far where there is one"""
@@ -187,7 +188,8 @@ class _Work:
         sharp = [r for r in self.levels if r <= ANALYSIS and self._texels(r) <= 1.5]
         self.analysis_level = max(sharp, default=self.levels[0])
         tiled = np.prod(self._box[1] - self._box[0]) > LARGEST_WHOLE
-        tile = 1024 if tiled else None
+        height, width = (int(n) for n in self._box[1] - self._box[0])
+        tile = even_tile((height, width)) if tiled else None
         self._grams = jax.jit(lambda net, image: grams(net, image, settings.layers, tile))
         self.tile = tile
 
