@@ -35,6 +35,9 @@ ANALYSIS = 512
 PHOTO_BLUR = 0.6
 """standard deviation of the low-pass that passes what a photo holds, in its pixels"""
 
+LARGEST_GAIN = 3.0
+"""by which what a small part of the face shows is taken to hold for the whole"""
+
 LARGEST_WHOLE = 1 << 20
 """texels up to which statistics are taken in one piece; beyond, in tiles"""
 
@@ -61,6 +64,9 @@ class CompletionSettings:
     match_complexion: bool = True
     """compare and blend the subjects' detail on the photo's complexion; False: as in the paper,
     where tone counts too"""
+    carry: float | None = 1.0
+    """how far the hidden skin departs from the blend as the seen does; 0: the blend's as it is;
+    None: as in the paper, where the seen skin's statistics are the blend's, too"""
     start: str = "neighbour"
     """first intensities: ``neighbour`` (detail of the subject of the largest weight) or
     ``low_frequency`` (the paper's)"""
@@ -95,7 +101,7 @@ def complete(
     network: FeatureNetwork,
     settings: CompletionSettings | None = None,
     *,
-    blending: Blending = blend,
+    blending: Blending | Blend = blend,
     on_progress: Progress = lambda what, done, of, picture: None,
     resumed: Callable[[int], "Level | None"] = lambda level: None,
     finished: Callable[[int, "Level"], None] = lambda level, done: None,
@@ -111,7 +117,7 @@ def complete(
         network: extractor of features.
         settings: see `CompletionSettings`.
         blending: how statistics are blended, of the arguments of `stages.blend.blend`; for
-            instance ``nearest_subject``.
+            instance ``nearest_subject``; or a blend that is known already.
         on_progress: told of every step.
         resumed: a level (texels along a side) that an earlier run has finished.
         finished: told of every finished level.
@@ -173,7 +179,7 @@ class _Work:
         network: FeatureNetwork,
         settings: CompletionSettings,
         on_progress: Progress,
-        blending: Blending,
+        blending: Blending | Blend,
     ) -> None:
         self.seen, self.database, self.network = seen, database, network
         self.settings, self.on_progress, self.blending = settings, on_progress, blending
@@ -231,6 +237,8 @@ class _Work:
 
     def blend(self) -> Blend:
         """Section 4: compare what the photo shows with the same part of every subject."""
+        if isinstance(self.blending, Blend):
+            return self.blending
         level, count = self.analysis_level, len(self.database)
         photo, weight = self.photo(level)
         mask = self.mask(level) & (np.asarray(weight) > 0.5)
@@ -251,11 +259,26 @@ class _Work:
         # What was left out is made up for, so that the sum of the weights stays as it was.
         weights = blended.weights[used] * (blended.weights.sum() / blended.weights[used].sum())
         total: dict[str, Array] = {}
+        mask, carry = self.mask(level), self.settings.carry
         for share, index in zip(weights, used, strict=True):
-            found = self.statistics(self.subject(index, level), self.mask(level), level)
+            texture = self.subject(index, level)
+            found = self.statistics(texture, mask, level)
+            if carry is not None:
+                own = self.statistics(self.with_photo(texture, level), mask, level)
+                gain = self.gain(level, carry)
+                found = {name: g + gain * (own[name] - g) for name, g in found.items()}
             for name, value in found.items():
                 total[name] = share * value + total.get(name, 0.0)
-        return total
+        return {name: nearest_positive(value) for name, value in total.items()}
+
+    def gain(self, level: int, carry: float) -> float:
+        """What the seen skin's departure counts: 1, or as if the whole face departed like it."""
+        weight = np.asarray(self.photo(level)[1])[self.mask(level)]
+        return 1 + carry * min(1 / max(float(weight.mean()), 1e-3) - 1, LARGEST_GAIN - 1)
+
+    def with_photo(self, texture: Array, level: int) -> Array:
+        """A texture with the frequencies that the photo holds, where it is seen."""
+        return with_photo(texture, *self.photo(level), PHOTO_BLUR * self._texels(level))
 
     def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
         """The texture before synthesis: whole, sRGB-encoded."""
@@ -263,7 +286,7 @@ class _Work:
         texture = low
         if self.settings.start == "neighbour":
             texture = self.subject(nearest, level)
-        texture = with_photo(texture, *self.photo(level), PHOTO_BLUR * self._texels(level))
+        texture = self.with_photo(texture, level)
         skin = shrink(self.seen.skin[..., None].astype(np.float32), level)
         return np.asarray(skin * texture + (1 - skin) * low)
 
@@ -331,6 +354,12 @@ class _Work:
         inside = shrink(self.seen.inside[..., None].astype(np.float32), level)
         # Between the charts the nearest colours continue, so that a filter finds no dark rim.
         return np.asarray(push_pull(jnp.asarray(whole), jnp.asarray(inside[..., 0] > 0.99, float)))
+
+
+def nearest_positive(gram: Float[Array, "n n"]) -> Array:
+    """The nearest symmetric matrix without negative eigenvalues: differences may have some."""
+    values, vectors = jnp.linalg.eigh((gram + gram.T) / 2)
+    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
 
 
 def level_steps(iterations: int, levels: int) -> list[int]:
