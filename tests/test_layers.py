@@ -26,7 +26,7 @@ ALLOWED = {
     "training": NUMERICAL,
     "io": BASE | {"geometry", "imaging", "models", "assets"},
     "assets": set(),
-    "pipeline": NUMERICAL | {"stages", "io", "assets", ""},
+    "pipeline": NUMERICAL | {"stages", "training", "io", "assets", ""},
     "cli": {"pipeline", "io", ""},
     "__main__": {"cli"},
     "": NUMERICAL | {"stages", "training", "io", "pipeline"},

@@ -174,3 +174,20 @@ def features_info(
         table.add_row(name, str(channels))
     Console().print(table)
     console.print(network.licence)
+
+
+@features_app.command("train")
+def features_train(
+    out: Annotated[Path, typer.Option("--out", "-o", help="File of weights to write, .npz.")],
+    images: Annotated[
+        Path | None, typer.Argument(help="Folder of pictures; scikit-image's if not given.")
+    ] = None,
+    steps_: Annotated[int, typer.Option("--steps", help="Of the optimiser.")] = 300,
+    seed: Annotated[int, typer.Option("--seed", help="Of the initial weights and crops.")] = 0,
+) -> None:
+    """Train a feature network without labels; goes on where an earlier run stopped."""
+    from jaxface.pipeline.feature_training import train_features
+
+    with errors(), steps(f"features in {out}") as on_step:
+        train_features(images, out, steps_, seed, on_step)
+    console.print(f"wrote [bold]{out}[/bold]; use it as `--features {out}`")
