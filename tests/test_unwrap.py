@@ -272,9 +272,7 @@ def test_preview_keeps_what_is_known_and_matches_colours_elsewhere(scene):
     faces = jnp.asarray(scene.faces)
     # A low-frequency albedo of the right colours but half as bright.
     model = 0.5 * jnp.ones((len(scene.vertices), 3)) * jnp.array([0.5, 0.5, 0.45])
-    low = low_frequency_albedo(
-        result.albedo, result.weight, model, faces, scene.layout, cells=16
-    )
+    low = low_frequency_albedo(result.albedo, result.weight, model, faces, scene.layout, cells=16)
     preview = np.asarray(over_low_frequency(result.albedo, result.weight, low))
     sure = np.asarray(result.weight) == 1
     np.testing.assert_allclose(preview[sure], np.asarray(result.albedo)[sure], atol=1e-6)

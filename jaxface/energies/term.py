@@ -85,6 +85,7 @@ class Energy(NamedTuple):
                 f"the energy is not a sum of squares: term(s) {scalar} are scalar; "
                 "give them as residuals or use a general minimiser"
             )
+
         def scaled(term: Term) -> PyTree:
             weight = term.weight_at(args)
             return jax.tree.map(
