@@ -1,0 +1,86 @@
+"""A texture seen in the mirror: what the other half of a face shows, brought over."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxface._types import Array, Float
+from jaxface.geometry.uv import UVLayout
+from jaxface.models.morphable import MorphableModel
+from jaxface.stages.texture_transfer import resample_texture
+
+
+def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r 2"]:
+    """Texture coordinates of the mirror image of every texel; NaN where there is none.
+
+    The mirror is the plane x = 0 of the mean face. Each triangle is paired with the nearest one
+    to its mirror image, in whose plane the texel's mirrored point is expressed; neither the
+    layout nor the triangulation needs to be symmetric.
+    """
+    faces, uv_faces = np.asarray(model.faces), np.asarray(model.uv_faces)
+    corners = np.asarray(model.mean, np.float64)[faces]
+    flip = np.array([-1.0, 1.0, 1.0])
+    extent = np.sqrt(np.mean((corners - corners.mean(axis=1, keepdims=True)) ** 2))
+    edge = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    # Normals keep the two sides of thin parts (lids, lips) apart.
+    tree = KDTree(np.concatenate([corners.mean(axis=1), 2 * extent * normal], axis=1))
+    mirrored = np.concatenate([corners.mean(axis=1) * flip, 2 * extent * normal * flip], axis=1)
+    partner = tree.query(mirrored)[1]
+
+    triangle = np.asarray(layout.triangle)
+    present = triangle >= 0
+    b, c = np.asarray(layout.barycentric, np.float64)[present].T
+    own = triangle[present]
+    point = (corners[own, 0] + b[:, None] * edge[own, 0] + c[:, None] * edge[own, 1]) * flip
+    other = partner[own]
+    first, second = edge[other, 0], edge[other, 1]
+    offset = point - corners[other, 0]
+    aa, ab, bb = (
+        np.sum(p * q, axis=1) for p, q in ((first, first), (first, second), (second,) * 2)
+    )
+    oa, ob = np.sum(offset * first, axis=1), np.sum(offset * second, axis=1)
+    determinant = np.maximum(aa * bb - ab * ab, 1e-12)
+    # Beyond its partner's edge a point is on a neighbour; farther it has no partner.
+    weights = [(bb * oa - ab * ob) / determinant, (aa * ob - ab * oa) / determinant]
+    on_b, on_c = (np.clip(w, -1.0, 2.0)[:, None] for w in weights)
+    uv = np.asarray(model.uv, np.float64)[uv_faces[other]]
+    found = uv[:, 0] * (1 - on_b - on_c) + uv[:, 1] * on_b + uv[:, 2] * on_c
+    near = np.abs(weights[0] - 0.5) + np.abs(weights[1] - 0.5) < 3.0
+    result = np.full((*triangle.shape, 2), np.nan, np.float32)
+    result[present] = np.where(near[:, None], found, np.nan)
+    return result
+
+
+def fill_from_mirror(
+    albedo: Float[Array, "r r 3"],
+    weight: Float[Array, "r r"],
+    low_frequency: Float[Array, "r r 3"],
+    source_uv: Float[Array, "r r 2"],
+    layout: UVLayout,
+) -> tuple[Float[Array, "r r 3"], Float[Array, "r r"]]:
+    """A whole texture: what is seen, else what its mirror image shows, else the low frequencies.
+
+    Of the mirror image the detail is taken over, the ratio to its own low frequencies, so that
+    the two halves may differ in tone.
+
+    Args:
+        albedo: partial, linear RGB.
+        weight: how far each texel is to be trusted, 0 to 1.
+        low_frequency: whole, linear RGB.
+        source_uv: from ``mirror_uv``.
+        layout: of all of them.
+
+    Returns:
+        Linear RGB, and the weight of the mirror image in it.
+    """
+    detail = jnp.clip(albedo / jnp.maximum(low_frequency, 1e-4), 1 / 3, 3.0)
+    both = jnp.concatenate([detail * weight[..., None], weight[..., None]], axis=-1)
+    present = layout.triangle >= 0
+    found = resample_texture(both, present, source_uv, layout).texture
+    trust = jnp.clip(found[..., 3], 0.0, 1.0)
+    other = found[..., :3] / jnp.maximum(found[..., 3:], 1e-3)
+    filled = low_frequency * (1 + trust[..., None] * (other - 1))
+    seen = weight[..., None]
+    return seen * albedo + (1 - seen) * filled, (1 - weight) * trust
