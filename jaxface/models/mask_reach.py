@@ -17,6 +17,9 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from jaxface._types import Bool, Int
 from jaxface.models.winograd import TILE
 
+PYRAMID = 4
+"""levels of a pyramid of cells, each twice as wide as the one before"""
+
 _SQUARE = np.ones((3, 3), bool)
 
 
@@ -108,6 +111,32 @@ def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a
     return padded.reshape(rows, cell, columns, cell).all(axis=(1, 3))
 
 
+def clear_nodes(
+    mask: Bool[np.ndarray, "h w"], cell: int
+) -> Int[np.ndarray, "n"]:
+    """The fewest nodes of a pyramid of cells that cover all cells that are true throughout.
+
+    The nodes of a level follow those of the finer one, row by row; see `pyramid_shapes`.
+    """
+    found, start = [], 0
+    shapes = pyramid_shapes(mask.shape, cell)
+    for level, (rows, columns) in enumerate(shapes):
+        whole = whole_cells(mask, cell << level)
+        if level + 1 < len(shapes):
+            above = whole_cells(mask, cell << level + 1).repeat(2, axis=0).repeat(2, axis=1)
+            found.append(start + np.flatnonzero(whole & ~above[:rows, :columns]))
+        else:
+            found.append(start + np.flatnonzero(whole))
+        start += rows * columns
+    return np.concatenate(found)
+
+
+def pyramid_shapes(shape: tuple[int, ...], cell: int) -> list[tuple[int, int]]:
+    """Rows and columns of each level of the pyramid of cells over a map."""
+    sides = [cell << level for level in range(PYRAMID)]
+    return [(-(-shape[0] // side), -(-shape[1] // side)) for side in sides]
+
+
 def plan(
     blocks: Sequence[Sequence[str]],
     visible: Bool[np.ndarray, "h w"],
@@ -131,7 +160,7 @@ def plan(
     needed, wanted_inputs = _needed(blocks, seen, inputs, cells)
     works: dict[str, Work] = {}
     splices: list[Splice] = []
-    rows = np.zeros(0, np.int32)
+    rows = np.zeros(0, np.intp)
     for index, block in enumerate(blocks):
         shape = inputs[index].clear.shape
         small = (blank_shape[0] >> index, blank_shape[1] >> index)
@@ -152,14 +181,14 @@ def plan(
             place = np.where(ok, patch_y * shape[1] + patch_x, 0)
             sources = np.where(ok, rows.reshape(-1)[place], 0).reshape(len(offsets) ** 2, -1)
             inner = slice(1, side + 1)
-            rows = np.zeros(shape[0] * shape[1], np.int32)
-            numbers = 1 + np.arange(side * side * len(y), dtype=np.int32)
+            rows = np.zeros(shape[0] * shape[1], np.intp)
+            numbers = 1 + np.arange(side * side * len(y), dtype=np.intp)
             numbers = numbers.reshape(side, side, len(y))
             rows[place[inner, inner][ok[inner, inner]]] = numbers[ok[inner, inner]]
-            counted = np.zeros(0, np.int32)
+            counted = np.zeros(0, np.intp)
             if name in cells:
                 counted = rows[np.flatnonzero(_counted(seen[name], cells[name]))]
-            works[name] = Work(sources.astype(np.int32), counted)
+            works[name] = Work(sources, counted)
     return Plan(works, tuple(splices), {name: seen[name] for name in cells})
 
 
@@ -217,10 +246,10 @@ def _splice(
     blank = np.flatnonzero(wanted & reach.blank & ~reach.clear)
     cached = np.flatnonzero(wanted & reach.clear)
     mixed = np.flatnonzero(wanted & reach.mixed)
-    rows = np.zeros(height * width, np.int32)
+    rows = np.zeros(height * width, np.intp)
     order = np.concatenate([blank, cached, mixed])
     rows[order] = 1 + np.arange(len(order))
-    fresh = np.zeros((4, 0), np.int32)
+    fresh = np.zeros((4, 0), np.intp)
     if len(mixed):
         y, x = np.divmod(mixed, width)
         places = [(2 * y + dy) * above + 2 * x + dx for dy in (0, 1) for dx in (0, 1)]
@@ -249,12 +278,12 @@ def blank_place(
 def covering_tiles(
     needed: Bool[np.ndarray, "h w"],
 ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"]]:
-    """Tops and left edges of disjoint 4x4 tiles that cover the given pixels; few, not fewest."""
+    """Tops and left edges of disjoint 4x4 tiles that cover the given pixels: few, not fewest."""
     height, width = needed.shape
     strips = np.pad(needed, ((0, -height % TILE), (0, 0)))
     strips = strips.reshape(-1, TILE, width).any(axis=1)
     tops, lefts = [], []
-    for strip in np.flatnonzero(strips.any(axis=1)):
+    for strip in np.flatnonzero(strips.any(axis=1)).tolist():
         edge = -1
         for column in np.flatnonzero(strips[strip]).tolist():
             if column >= edge:

@@ -30,11 +30,22 @@ from jaxface.models.features import (
     pool,
     with_indicator,
 )
-from jaxface.models.mask_reach import Plan, blank_place, plan, whole_cells
-from jaxface.models.winograd_tiles import TILES_AT_ONCE, convolve_tiles, transformed_kernel
+from jaxface.models.mask_reach import Plan, blank_place, clear_nodes, plan, pyramid_shapes
+from jaxface.models.winograd_tiles import (
+    TILES_AT_ONCE,
+    convolve_pixels,
+    convolve_tiles,
+    transformed_kernel,
+)
 
 Stored = Mapping[str, np.ndarray]
 """what is cached of a texture, by the names of `layout`"""
+
+ROWS_AT_ONCE = 2048
+"""pixels of one product; smaller ones are filled up with zeros"""
+
+_LARGEST_CELLS = 8.5
+"""numbers in a layer's finest cells, for each pixel of the texture, at most"""
 
 _SMALLEST_CELLED = 192
 """px; of smaller maps the responses themselves are cached"""
@@ -69,8 +80,8 @@ def layout(
         network: the extractor.
         shape: height and width of the textures.
         layers: those whose Gram matrices are wanted.
-        cells: by layer, side of its cells (px of its map), 0 to cache responses; by default the
-            smallest power of two, from 16, whose sums take little memory beside the responses.
+        cells: by layer, side of its cells (px of its map), 0 to cache responses; by default
+            the smallest power of two, from 8, whose sums are not too many.
 
     Raises:
         ValueError: a layer is unknown, or its map would be empty.
@@ -88,14 +99,15 @@ def layout(
             shapes[f"pool{index}"] = (height * width, channels)
         for name in (name for name in block if name in layers):
             n = network.channels[name]
-            cell = 16
-            while cell**2 < 2 * n:
+            packed = n * (n + 1) // 2
+            cell = 8 if index else 16
+            while -(-height // cell) * -(-width // cell) * packed > _LARGEST_CELLS * math.prod(shape):
                 cell *= 2
             cell = cell if min(height, width) >= _SMALLEST_CELLED else 0
             cell = chosen[name] = cell if cells is None else cells.get(name, cell)
             if cell:
-                count = -(-height // cell) * -(-width // cell)
-                shapes[f"{name}/cells"] = (count, n * (n + 1) // 2)
+                count = sum(math.prod(level) for level in pyramid_shapes((height, width), cell))
+                shapes[f"{name}/cells"] = (count, packed)
             else:
                 shapes[name] = (height * width, n)
     for name in list(shapes)[1:]:
@@ -146,7 +158,7 @@ def compressed(found: Mapping[str, Array], layout: Layout) -> dict[str, np.ndarr
 
 
 def _cell_sums(x: Float[Array, "h w n"], cell: int) -> Float[Array, "c m"]:
-    """Upper triangles of ``sum F F^T`` over square cells."""
+    """Upper triangles of ``sum F F^T`` over the nodes of a pyramid of square cells."""
     height, width, n = x.shape
     x = jnp.pad(x, ((0, -height % cell), (0, -width % cell), (0, 0)))
     rows, columns = x.shape[0] // cell, x.shape[1] // cell
@@ -157,14 +169,19 @@ def _cell_sums(x: Float[Array, "h w n"], cell: int) -> Float[Array, "c m"]:
         return jnp.einsum("ycxi,ycxj->cij", parts, parts)[:, upper[0], upper[1]]
 
     sums = lax.map(of_row, x.reshape(rows, cell, columns * cell, n))
-    return sums.reshape(rows * columns, -1)
+    levels = [sums]
+    for rows, columns in pyramid_shapes((height, width), cell)[1:]:
+        odd = [(0, 2 * rows - sums.shape[0]), (0, 2 * columns - sums.shape[1]), (0, 0)]
+        sums = jnp.pad(sums, odd).reshape(rows, 2, columns, 2, -1).sum(axis=(1, 3))
+        levels.append(sums)
+    return jnp.concatenate([level.reshape(-1, level.shape[-1]) for level in levels])
 
 
 class _Layer(NamedTuple):
     """A layer's weights as the tiles need them."""
 
-    kernel: Array | np.ndarray
-    bias: np.ndarray
+    kernel: Array
+    bias: Array
     tiled: bool
 
 
@@ -226,13 +243,15 @@ def prepare(
         rows = maps[name][present]
         constant[name] = (rows * times[present, None].astype(np.float32)).T @ rows
         cell = layout.cells[name]
-        clear[name] = np.flatnonzero(whole_cells(reach.clear, cell) if cell else reach.clear)
+        clear[name] = (
+            clear_nodes(reach.clear, cell) if cell else np.flatnonzero(reach.clear)
+        )
     weights = {
         name: _Layer(
             transformed_kernel(network.kernels[name])
             if tiled[name]
-            else np.asarray(network.kernels[name]).reshape(-1, network.channels[name]),
-            np.asarray(network.biases[name]),
+            else jnp.asarray(network.kernels[name]).reshape(9, -1, network.channels[name]),
+            network.biases[name],
             tiled[name],
         )
         for name in work.works
@@ -286,8 +305,7 @@ def masked_grams_of(prepared: Prepared, stored: Stored) -> dict[str, Float[np.nd
             work = prepared.plan.works[name]
             rows = _convolved(prepared.layers[name], rows, work.sources)
             if name in prepared.constant:
-                counted = rows[work.counted]
-                total = prepared.constant[name] + counted.T @ counted
+                total = prepared.constant[name] + _second_moment(rows, work.counted)
                 total += _clear_sum(prepared, stored, name)
                 pixels = (prepared.shape[0] >> index) * (prepared.shape[1] >> index)
                 found[name] = total / pixels
@@ -329,24 +347,55 @@ def _convolved(
     """Table of a layer from that of its input."""
     count = sources.shape[1]
     outputs = layer.bias.shape[0]
-    if not layer.tiled:
-        table = np.zeros((1 + count, outputs), np.float32)
-        patches = rows[sources.T].reshape(count, -1)
-        np.matmul(patches, layer.kernel, out=table[1:])
-        table[1:] += layer.bias
-        np.maximum(table[1:], 0, out=table[1:])
-        return table
-    table = np.empty((1 + 16 * count, outputs), np.float32)
+    of_tile, step = (16, TILES_AT_ONCE) if layer.tiled else (1, ROWS_AT_ONCE)
+    convolve = convolve_tiles if layer.tiled else convolve_pixels
+    table = np.empty((1 + of_tile * count, outputs), np.float32)
     table[0] = 0
-    tiles = table[1:].reshape(16, count, outputs)
-    patches = np.zeros((36, TILES_AT_ONCE, rows.shape[1]), np.float32)
-    for start in range(0, count, TILES_AT_ONCE):
-        part = sources[:, start : start + TILES_AT_ONCE]
-        size = part.shape[1]
-        patches[:, :size] = rows[part]
-        result = convolve_tiles(patches, layer.kernel, layer.bias)
-        tiles[:, start : start + size] = np.asarray(result)[:, :size]
+    tiles = table[1:].reshape(of_tile, count, outputs)
+    padded = np.pad(sources, ((0, 0), (0, -count % (step // 4))))  # row 0 is zero
+    # One call computes while the patches of the next are gathered.
+    waiting: list[tuple[int, Array]] = []
+    for start in range(0, count, step):
+        some = padded[:, start : start + step]
+        patches = _aligned(*some.shape, rows.shape[1])
+        np.take(rows, some, axis=0, mode="clip", out=patches)
+        waiting.append((start, convolve(patches, layer.kernel, layer.bias)))
+        if len(waiting) > 1 or start + step >= count:
+            for place, result in waiting:
+                size = min(step, count - place)
+                tiles[:, place : place + size] = np.asarray(result)[:, :size]
+            waiting.clear()
     return table
+
+
+def _aligned(*shape: int) -> Float[np.ndarray, "..."]:
+    """An uninitialised array that XLA reads where it lies, without a copy."""
+    size = math.prod(shape)
+    memory = np.empty(size + 16, np.float32)
+    start = -(memory.ctypes.data // 4) % 16
+    return memory[start : start + size].reshape(shape)
+
+
+@jax.jit
+def _add_products(
+    total: Float[Array, "n n"], rows: Float[Array, "r n"]
+) -> Float[Array, "n n"]:
+    return total + lax.dot_general(rows, rows, (((0,), (0,)), ((), ())))
+
+
+def _second_moment(
+    rows: Float[np.ndarray, "r n"], counted: np.ndarray
+) -> Float[np.ndarray, "n n"]:
+    """Sum of ``F F^T`` over some rows; products of one shape, so that one program serves all."""
+    total = jnp.zeros((rows.shape[1],) * 2, jnp.float32)
+    for start in range(0, len(counted), ROWS_AT_ONCE):
+        some = counted[start : start + ROWS_AT_ONCE]
+        size = -(-len(some) // (ROWS_AT_ONCE // 4)) * (ROWS_AT_ONCE // 4)
+        part = _aligned(size, rows.shape[1])
+        part[: len(some)] = rows.take(some, axis=0, mode="clip")
+        part[len(some) :] = 0
+        total = _add_products(total, part)
+    return np.asarray(total)
 
 
 def _clear_sum(prepared: Prepared, stored: Stored, name: str) -> Float[np.ndarray, "n n"]:
@@ -354,10 +403,9 @@ def _clear_sum(prepared: Prepared, stored: Stored, name: str) -> Float[np.ndarra
     clear = prepared.clear[name]
     n = len(prepared.constant[name])
     if not prepared.layout.cells[name]:
-        rows = stored[name][clear].astype(np.float32)
-        return rows.T @ rows * stored[f"{name}/scale"][0] ** 2
+        return _second_moment(stored[name], clear) * stored[f"{name}/scale"][0] ** 2
     sums = stored[f"{name}/cells"][clear].astype(np.float32)
-    packed = stored[f"{name}/cells/scale"][clear] @ sums
+    packed = np.einsum("c,cm->m", stored[f"{name}/cells/scale"][clear], sums)
     total = np.zeros((n, n), np.float32)
     total[np.triu_indices(n)] = packed
     return total + np.triu(total, 1).T
