@@ -111,9 +111,7 @@ def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a
     return padded.reshape(rows, cell, columns, cell).all(axis=(1, 3))
 
 
-def clear_nodes(
-    mask: Bool[np.ndarray, "h w"], cell: int
-) -> Int[np.ndarray, "n"]:
+def clear_nodes(mask: Bool[np.ndarray, "h w"], cell: int) -> Int[np.ndarray, "n"]:
     """The fewest nodes of a pyramid of cells that cover all cells that are true throughout.
 
     The nodes of a level follow those of the finer one, row by row; see `pyramid_shapes`.

@@ -55,7 +55,9 @@ def convolve_pixels(
     return jnp.maximum(rows @ kernel.reshape(-1, kernel.shape[2]) + bias, 0)[None]
 
 
-def _both_axes(matrix: Float[Array, "a b"], values: Float[Array, "bb t n"]) -> Float[Array, "a a m"]:
+def _both_axes(
+    matrix: Float[Array, "a b"], values: Float[Array, "bb t n"]
+) -> Float[Array, "a a m"]:
     """A matrix along both axes of tiles that are listed row by row."""
     points, size = matrix.shape
     first = (matrix @ values.reshape(size, -1)).reshape(points, size, -1)

@@ -1,0 +1,130 @@
+"""Gram matrices of a whole database behind any mask, from what is computed once of each texture."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Bool, Float
+from jaxface.imaging.colour import rgb_to_yiq
+from jaxface.io.gram_cache import GramCache, digest
+from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
+from jaxface.stages.masked_grams import (
+    Layout,
+    compressed,
+    layout,
+    masked_grams_of,
+    prepare,
+    store,
+)
+
+FOLDER = "grams"
+"""folder of the cache in a database's"""
+
+LARGEST_BYTES = 64 * 1024**3
+"""what a cache may hold, unless said otherwise"""
+
+
+@dataclass(frozen=True)
+class PrecomputedGrams:
+    """What is cached of a database's textures for one network and resolution."""
+
+    network: FeatureNetwork
+    layout: Layout
+    files: GramCache
+    keys: tuple[str, ...]
+    """of the textures' files, in the database's order"""
+
+
+def precompute(
+    database: TextureDatabase,
+    network: FeatureNetwork,
+    resolution: int | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
+    *,
+    layers: Sequence[str] = STYLE_LAYERS,
+    folder: str | os.PathLike[str] | None = None,
+    maximum_bytes: int = LARGEST_BYTES,
+) -> PrecomputedGrams:
+    """Compute and keep what `masked_grams` needs; textures that lie there whole are not redone.
+
+    Args:
+        database: the textures.
+        network: extractor of features.
+        resolution: texels along a side; a divisor of the database's, by default the same.
+        on_progress: told after every texture: how many are done, of how many.
+        layers: those whose Gram matrices will be asked for.
+        folder: of the cache, by default ``grams`` in the database's folder.
+        maximum_bytes: what the cache may come to hold.
+
+    Raises:
+        ValueError: the resolution does not divide the database's, or the cache would be too big.
+    """
+    side = database.resolution if resolution is None else resolution
+    if side < 1 or database.resolution % side:
+        raise ValueError(
+            f"resolution is {side}; needed is a divisor of the database's {database.resolution}"
+        )
+    plan = layout(network, (side, side), layers)
+    files = GramCache(folder or database.path / FOLDER, plan.shapes, plan.types)
+    size = files.bytes_per_texture * len(database)
+    if size > maximum_bytes:
+        raise ValueError(
+            f"the cache of {len(database)} textures would hold {size} bytes, more than the "
+            f"{maximum_bytes} allowed; a lower resolution needs a quarter for each halving"
+        )
+    identity = digest(
+        network.pooling,
+        repr(plan),
+        *(network.kernels[name] for name in network.layers),
+        *(network.biases[name] for name in network.layers),
+    )
+    compute = jax.jit(lambda network, image: store(network, image, plan))
+    keys = []
+    for index, name in enumerate(database.names):
+        image = intensity(database.encoded(name), side)
+        key = digest(identity, image)
+        if not files.is_whole(key):
+            files.write(key, compressed(compute(network, jnp.asarray(image)), plan))
+        keys.append(key)
+        on_progress(index + 1, len(database))
+    return PrecomputedGrams(network, plan, files, tuple(keys))
+
+
+def intensity(encoded: Float[np.ndarray, "r r 3"], side: int) -> Float[np.ndarray, "s s"]:
+    """Y of YIQ of an sRGB-encoded texture, averaged over blocks of texels."""
+    factor = len(encoded) // side
+    blocks = np.asarray(encoded, np.float32).reshape(side, factor, side, factor, 3)
+    return np.asarray(rgb_to_yiq(jnp.asarray(blocks.mean(axis=(1, 3))))[..., 0], np.float32)
+
+
+def masked_grams(
+    cache: PrecomputedGrams,
+    mask: Bool[np.ndarray, "r r"],
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, Float[np.ndarray, "k n n"]]:
+    """Gram matrices ``G^l(M(I_k))`` of all textures behind one mask, by layer.
+
+    Args:
+        cache: by `precompute`.
+        mask: true where visible, row 0 at the top, at the cache's resolution.
+        on_progress: told after every texture.
+
+    Raises:
+        ValueError: the mask is of another shape, or a file has been damaged since.
+    """
+    prepared = prepare(cache.network, mask, cache.layout)
+    channels = cache.network.channels
+    found = {
+        name: np.empty((len(cache.keys), channels[name], channels[name]), np.float32)
+        for name in cache.layout.cells
+    }
+    for index, key in enumerate(cache.keys):
+        for name, value in masked_grams_of(prepared, cache.files.read(key)).items():
+            found[name][index] = value
+        on_progress(index + 1, len(cache.keys))
+    return found
