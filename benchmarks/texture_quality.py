@@ -59,6 +59,8 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
     """What is compared, in order of value."""
     for case in ("left", "oval"):
         yield Variant("core", f"completed, {case}", case=case)
+    for name, carry in (("None (the paper's)", None), ("0", 0.0), ("0.5", 0.5)):
+        yield Variant("carry", name, {"carry": carry})
     networks = ["random-vgg19", *(["trained"] if TRAINED.is_file() else [])]
     three = {"layers": STYLE_LAYERS[:3]}
     for name in networks:
@@ -72,7 +74,8 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
     yield Variant("start", "low_frequency", {"start": "low_frequency"})
     yield Variant("complexion", "as they are", {"match_complexion": False})
     yield Variant("paper", "all of the paper's", {
-        "match_complexion": False, "start": "low_frequency", "weights": SynthesisWeights(photo=0.0)
+        "match_complexion": False, "start": "low_frequency", "carry": None,
+        "weights": SynthesisWeights(photo=0.0),
     })  # fmt: skip
     yield Variant("database", "imported", painted=False, imported=True)
     yield Variant("database", "both", imported=True)
@@ -96,7 +99,7 @@ class Bench:
         self.options, self.side = options, options.side
         self.truth = read_truth(options.real, self.side)
         self.cases: dict[str, Case] = {}
-        self.done: dict[str, Completed] = {}
+        self.columns: dict[str, tuple[Any, Any]] = {}
 
     @cached_property
     def painted(self) -> Skins:
@@ -139,27 +142,46 @@ class Bench:
         )
         started = time.perf_counter()
         done = complete(
-            case.seen, self.database(variant), load_network(variant.features), settings,
-            blending=variant.blending,
-        )  # fmt: skip
+            case.seen,
+            self.database(variant),
+            load_network(variant.features),
+            settings,
+            blending=self.blending(variant, settings, variant.blending),
+        )
         seconds = time.perf_counter() - started
         values = self.measured(done.albedo, case)
         values["seconds"] = seconds
         values["subjects used"] = float(np.sum(np.abs(done.blended.weights) > 1e-3))
         return values, done, case
 
+    def blending(
+        self, variant: Variant, settings: CompletionSettings, how: Callable[..., Any]
+    ) -> Any:
+        """A blend from an analysis that was made before, or the function to make it with."""
+        same = (
+            variant.case, variant.features, variant.subjects, variant.painted, variant.imported,
+            variant.poor, settings.layers, settings.match_complexion,
+        )  # fmt: skip
+        key = repr(same)
+        if key in self.columns:
+            return how(*self.columns[key], norm=settings.norm)
+
+        def remembered(columns: Any, goal: Any, norm: Any) -> Any:
+            self.columns[key] = columns, goal
+            return how(columns, goal, norm=norm)
+
+        return remembered
+
     def baselines(self, variant: Variant, done: Completed, case: Case) -> dict[str, Any]:
         """What a completion must beat, and what no completion knows."""
         skins, rows = self.database(variant), {}
         rows["low frequencies"] = case.seen.low_frequency
         plain, own = {}, {}
-        paper = {"match_complexion": False, "iterations": 1}
         network = load_network(variant.features)
-        for settings, found in ((paper, plain), ({"iterations": 1}, own)):
-            chosen = complete(
-                case.seen, skins, network, replace(CompletionSettings(), **settings),
-                blending=nearest_subject,
-            )  # fmt: skip
+        for settings, found in (({"match_complexion": False}, plain), ({}, own)):
+            given = replace(CompletionSettings(), iterations=1, **settings)
+            how = self.blending(variant, given, nearest_subject)
+            chosen = complete(case.seen, skins, network, given, blending=how)
             found["name"] = skins.names[int(np.argmax(chosen.blended.weights))]
         rows["nearest subject"] = skins.encoded(plain["name"])
         detail = with_complexion(

@@ -46,6 +46,7 @@ def markdown(stored: Mapping[str, Any]) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in p["versions"].items())
     parts.append(
         f"{p['date']}, commit {p['commit']}, {p['side']} texels a side, "
-        f"{p['iterations']} iterations, {p['processor']}, {p['cores']} cores, load {p['load']}, {packages}\n"
+        f"{p['iterations']} iterations, {p['processor']}, {p['cores']} cores, load {p['load']}, "
+        f"{packages}\n"
     )
     return "\n".join(parts)

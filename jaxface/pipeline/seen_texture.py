@@ -19,6 +19,7 @@ from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
 from jaxface.stages.fit.prepared import FACE_REGIONS
 from jaxface.stages.low_frequency import low_frequency_albedo
+from jaxface.stages.symmetry import with_other_side
 
 NOT_SKIN = ("eyes", "mouth_interior")
 
@@ -86,7 +87,7 @@ def seen_texture(
         )
     layout: UVLayout = uv_layout(model.uv, model.uv_faces, size)
     low = low_frequency_albedo(
-        jnp.asarray(albedo), jnp.asarray(weight),
+        *with_other_side(jnp.asarray(albedo), jnp.asarray(weight), model, layout),
         model.reflectance(jnp.asarray(coefficients)), model.faces, layout,
     )  # fmt: skip
     triangle = np.maximum(np.asarray(layout.triangle), 0)
