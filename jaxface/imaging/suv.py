@@ -179,7 +179,7 @@ def _hat(x: Array, count: int) -> Array:
 
 def _lower_average(ratio: Array, sure: Array, splat, slice_, rounds: int) -> tuple[Array, Array]:
     """Per-pixel robust average of the ratio that high outliers do not lift, and its spread."""
-    usable = jnp.where(sure > 0.05, jax.lax.stop_gradient(ratio), jnp.nan)
+    usable = jnp.where(sure > 0.05, ratio, jnp.nan)
     low, middle = (jnp.nan_to_num(jnp.nanquantile(usable, q)) for q in (0.2, 0.5))
     spread = jnp.maximum(middle - low, 0.02 * jnp.abs(middle) + 1e-6)
     usual = jnp.full_like(ratio, middle)

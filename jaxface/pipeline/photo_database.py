@@ -170,7 +170,14 @@ def _lights(
     if known is None:
         solved = common_light(stacked, mean, basis)
         alike = _alike(solved, own)
-        if 0 < alike.sum() < len(alike):
+        if alike.sum() < 2:
+            # A light that one photo alone follows is nobody's common light.
+            told = f"the photos share no light: {alike.sum()} of {len(alike)} would be under it"
+            return {
+                n: _Lighting(s.parameters.light, _facts(s, "own"), f"{s.path.name}: {told}")
+                for n, s in sources.items()
+            }
+        if alike.sum() < len(alike):
             # Photos under another light must not bend the one that the rest share.
             chosen = jax.tree.map(lambda x: x[np.flatnonzero(alike)], stacked)
             solved = common_light(chosen, mean, basis)

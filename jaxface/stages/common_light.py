@@ -96,7 +96,7 @@ def common_light(
     basis: Float[Array, "n 3 a"],
     *,
     light: Float[Array, "9 3"] | None = None,
-    prior: float = 0.01,
+    prior: float = 1e-4,
     rounds: int = 30,
 ) -> CommonLight:
     """Solve for the light of several photos, their gains and albedos, by alternating least squares.

@@ -6,8 +6,8 @@ from scipy.spatial import KDTree
 
 from jaxface._types import Array, Float
 from jaxface.geometry.uv import UVLayout
+from jaxface.imaging.resample import bilinear
 from jaxface.models.morphable import MorphableModel
-from jaxface.stages.texture_transfer import resample_texture
 
 
 def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r 2"]:
@@ -77,8 +77,11 @@ def fill_from_mirror(
     """
     detail = jnp.clip(albedo / jnp.maximum(low_frequency, 1e-4), 1 / 3, 3.0)
     both = jnp.concatenate([detail * weight[..., None], weight[..., None]], axis=-1)
-    present = layout.triangle >= 0
-    found = resample_texture(both, present, source_uv, layout).texture
+    size = layout.resolution
+    known = jnp.all(jnp.isfinite(source_uv), axis=-1)
+    place = jnp.where(known[..., None], source_uv, 0.0)
+    points = jnp.stack([place[..., 0], 1.0 - place[..., 1]], axis=-1) * size
+    found = bilinear(both, points.reshape(-1, 2)).reshape(size, size, 4) * known[..., None]
     trust = jnp.clip(found[..., 3], 0.0, 1.0)
     other = found[..., :3] / jnp.maximum(found[..., 3:], 1e-3)
     filled = low_frequency * (1 + trust[..., None] * (other - 1))
