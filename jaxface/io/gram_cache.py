@@ -1,7 +1,8 @@
 """Arrays of many textures on disk: one memory-mapped file a texture, whole or absent.
 
-A file starts with a header of 64 bytes: ``jaxface-grams1``, two newlines, the key (32 bytes) and the checksum of the rest (CRC-32, 8 hexadecimal digits); the arrays follow, each at a multiple
-of 64 bytes, little-endian. The key is a digest of everything the arrays depend on.
+A file starts with a header of 64 bytes: ``jaxface-grams1``, two newlines, the key (32 bytes) and
+the checksum of the rest (CRC-32, 8 hexadecimal digits). The arrays follow, each at a multiple of
+64 bytes, little-endian. The key is a digest of everything the arrays depend on.
 """
 
 import hashlib
