@@ -272,7 +272,6 @@ def _blank_maps(
     network: FeatureNetwork, shape: tuple[int, int], blocks: Sequence[tuple[str, ...]]
 ) -> dict[str, Float[np.ndarray, "p n"]]:
     """All responses to a constant image, and each block's input as ``poolB``."""
-
     found = _blank_responses(network, shape, tuple(blocks))
     return {name: np.asarray(value) for name, value in found.items()}
 
