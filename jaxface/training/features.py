@@ -130,7 +130,7 @@ def train(
         learner: Learner, memory: optax.OptState, crops: Float[Array, "2 b s s"]
     ) -> tuple[Array, Learner, optax.OptState]:
         loss, gradient = jax.value_and_grad(contrastive_loss)(learner, crops)
-        change, memory = rule.update(gradient, memory, learner)
+        change, memory = rule.update(gradient, memory)
         return loss, optax.apply_updates(learner, change), memory  # type: ignore[return-value]
 
     while state.step < steps:
@@ -210,7 +210,7 @@ def crop_pairs(
                 break
         if vary:
             turned = pair[:, ::-1] if generator.random() < 0.5 else pair
-            pair[:] = np.rot90(turned, generator.integers(4), (1, 2)).copy()
+            pair[:] = np.rot90(turned, int(generator.integers(4)), (1, 2)).copy()
             gain = np.exp(generator.uniform(-GAIN, GAIN, (2, 1, 1)))
             mean = pair.mean(axis=(1, 2), keepdims=True)
             offset = generator.uniform(-OFFSET, OFFSET, (2, 1, 1))
