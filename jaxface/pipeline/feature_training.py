@@ -196,11 +196,11 @@ class _Checkpoint:
 
     def write(self, state: TrainingState) -> None:
         leaves = jax.tree.leaves(eqx.filter((state.learner, state.optimiser), eqx.is_array))
-        arrays = {f"leaf{i}": np.asarray(x) for i, x in enumerate(leaves)}
+        arrays: dict[str, Any] = {f"leaf{i}": np.asarray(x) for i, x in enumerate(leaves)}
         with atomic_path(self.path) as temporary, open(temporary, "wb") as file:
             np.savez(
                 file, step=state.step, losses=state.losses, fingerprint=self._fingerprint, **arrays
-            )  # type: ignore[arg-type]
+            )
 
 
 def _report(
