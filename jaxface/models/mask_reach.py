@@ -100,7 +100,8 @@ def reaches(
 
 def _all_of_cell(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
     height, width = (side // 2 * 2 for side in mask.shape)
-    return mask[:height, :width].reshape(height // 2, 2, width // 2, 2).all(axis=(1, 3))
+    cells = mask[:height, :width].reshape(height // 2, 2, width // 2, 2)
+    return np.asarray(cells.all(axis=(1, 3)))
 
 
 def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a b"]:
@@ -108,7 +109,7 @@ def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % cell), (0, -width % cell)), constant_values=True)
     rows, columns = padded.shape[0] // cell, padded.shape[1] // cell
-    return padded.reshape(rows, cell, columns, cell).all(axis=(1, 3))
+    return np.asarray(padded.reshape(rows, cell, columns, cell).all(axis=(1, 3)))
 
 
 def clear_nodes(mask: Bool[np.ndarray, "h w"], cell: int) -> Int[np.ndarray, "n"]:
@@ -279,9 +280,9 @@ def covering_tiles(
     """Tops and left edges of disjoint 4x4 tiles that cover the given pixels: few, not fewest."""
     height, width = needed.shape
     strips = np.pad(needed, ((0, -height % TILE), (0, 0)))
-    strips = strips.reshape(-1, TILE, width).any(axis=1)
+    strips = np.asarray(np.any(strips.reshape(-1, TILE, width), axis=1))
     tops, lefts = [], []
-    for strip in np.flatnonzero(strips.any(axis=1)).tolist():
+    for strip in np.flatnonzero(np.any(strips, axis=1)).tolist():
         edge = -1
         for column in np.flatnonzero(strips[strip]).tolist():
             if column >= edge:

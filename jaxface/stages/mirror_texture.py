@@ -27,7 +27,7 @@ def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r
     # Normals keep the two sides of thin parts (lids, lips) apart.
     tree = KDTree(np.concatenate([corners.mean(axis=1), 2 * extent * normal], axis=1))
     mirrored = np.concatenate([corners.mean(axis=1) * flip, 2 * extent * normal * flip], axis=1)
-    partner = tree.query(mirrored)[1]
+    partner = np.asarray(tree.query(mirrored)[1])
 
     triangle = np.asarray(layout.triangle)
     present = triangle >= 0

@@ -6,7 +6,7 @@ guess of its low frequencies; detail is left to synthesis, for a copy of it woul
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxface._types import Array, Float
 from jaxface.geometry.uv import UVLayout
@@ -29,7 +29,7 @@ def mirrored_texels(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray
     The mean shape is mirrored in the plane x = 0 of the model's frame; NaN where it has no partner.
     """
     mean = np.asarray(model.mean, np.float64)
-    distance, partner = cKDTree(mean).query(mean * [-1.0, 1.0, 1.0])
+    distance, partner = KDTree(mean).query(mean * [-1.0, 1.0, 1.0])
     uv = np.full((len(mean), 2), np.nan, np.float32)
     uv[np.asarray(model.faces).ravel()] = np.asarray(model.uv)[np.asarray(model.uv_faces).ravel()]
     target = uv[partner]
@@ -60,7 +60,7 @@ def with_other_side(
     """
     uv = mirrored_texels(model, layout)
     size = layout.resolution
-    known = np.isfinite(uv).all(-1)
+    known = np.asarray(np.all(np.isfinite(uv), axis=-1))
     at = np.where(known[..., None], uv, 0.0)
     x, y = jnp.asarray(at[..., 0] * size), jnp.asarray((1.0 - at[..., 1]) * size)
     both = jnp.concatenate([albedo * weight[..., None], weight[..., None]], axis=-1)

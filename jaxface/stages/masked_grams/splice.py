@@ -12,7 +12,7 @@ changes a Gram matrix by less than 5e-4 of its Frobenius norm, half precision's 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -25,158 +25,23 @@ from jaxface._types import Array, Bool, Float
 from jaxface.energies.gram import MASKED
 from jaxface.models.conv3x3 import conv3x3_relu
 from jaxface.models.features import (
-    STYLE_LAYERS,
     FeatureNetwork,
     blocks_up_to,
     layer_position,
     pool,
     with_indicator,
 )
-from jaxface.models.mask_reach import Plan, blank_place, clear_nodes, plan, pyramid_shapes
+from jaxface.models.mask_reach import Plan, blank_place, clear_nodes, plan
 from jaxface.models.winograd_tiles import (
     TILES_AT_ONCE,
     convolve_pixels,
     convolve_tiles,
     transformed_kernel,
 )
-
-Stored = Mapping[str, np.ndarray]
-"""what is cached of a texture, by the names of `layout`"""
+from jaxface.stages.masked_grams.cells import Layout, Stored
 
 ROWS_AT_ONCE = 2048
 """pixels of one product; smaller ones are filled up with zeros"""
-
-_LARGEST_CELLS = 8.5
-"""numbers in a layer's finest cells, for each pixel of the texture, at most"""
-
-_SMALLEST_CELLED = 192
-"""px; of smaller maps the responses themselves are cached"""
-
-
-class Layout(NamedTuple):
-    """What is cached of a texture of one shape: shape and type of each array."""
-
-    shapes: dict[str, tuple[int, ...]]
-    types: dict[str, str]
-    cells: dict[str, int]
-    """of each layer, side of its cells in pixels of its map; 0: its responses are cached"""
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of one texture."""
-        return sum(
-            math.prod(shape) * np.dtype(self.types[name]).itemsize
-            for name, shape in self.shapes.items()
-        )
-
-
-def layout(
-    network: FeatureNetwork,
-    shape: tuple[int, int],
-    layers: Sequence[str] = STYLE_LAYERS,
-    cells: Mapping[str, int] | None = None,
-) -> Layout:
-    """What has to be cached of a texture.
-
-    Args:
-        network: the extractor.
-        shape: height and width of the textures.
-        layers: those whose Gram matrices are wanted.
-        cells: by layer, side of its cells (px of its map), 0 to cache responses; by default
-            the smallest power of two, from 8, whose sums are not too many.
-
-    Raises:
-        ValueError: a layer is unknown, or its map would be empty.
-    """
-    blocks = blocks_up_to(network, layers)
-    if min(shape) >> (len(blocks) - 1) == 0:
-        raise ValueError(f"a texture of {shape[0]}x{shape[1]} pixels has no {blocks[-1][-1]}")
-    shapes: dict[str, tuple[int, ...]] = {"image": shape}
-    types = {"image": "<f4"}
-    chosen: dict[str, int] = {}
-    for index, block in enumerate(blocks):
-        height, width = shape[0] >> index, shape[1] >> index
-        if index:
-            channels = network.channels[blocks[index - 1][-1]]
-            shapes[f"pool{index}"] = (height * width, channels)
-        for name in (name for name in block if name in layers):
-            n = network.channels[name]
-            packed = n * (n + 1) // 2
-            cell = 8 if index else 16
-            while -(-height // cell) * -(-width // cell) * packed > _LARGEST_CELLS * math.prod(
-                shape
-            ):
-                cell *= 2
-            cell = cell if min(height, width) >= _SMALLEST_CELLED else 0
-            cell = chosen[name] = cell if cells is None else cells.get(name, cell)
-            if cell:
-                count = sum(math.prod(level) for level in pyramid_shapes((height, width), cell))
-                shapes[f"{name}/cells"] = (count, packed)
-            else:
-                shapes[name] = (height * width, n)
-    for name in list(shapes)[1:]:
-        types[name], types[f"{name}/scale"] = "<f2", "<f4"
-        shapes[f"{name}/scale"] = (shapes[name][0] if name.endswith("cells") else 1,)
-    return Layout(shapes, types, {name: chosen[name] for name in layers})
-
-
-def store(network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout) -> dict[str, Array]:
-    """What is cached of a texture, in single precision; `compressed` halves it. May be jitted.
-
-    Args:
-        network: the extractor.
-        image: intensity in [0, 1], whole.
-        layout: as `layout` makes it for this network and shape.
-    """
-    found: dict[str, Array] = {"image": image}
-    x = with_indicator(image)
-    for index, block in enumerate(blocks_up_to(network, layout.cells)):
-        if index:
-            x = pool(x, network.pooling)
-            found[f"pool{index}"] = x.reshape(-1, x.shape[-1])
-        for name in block:
-            x = conv3x3_relu(x, network.kernels[name], network.biases[name])
-            if name not in layout.cells:
-                continue
-            if layout.cells[name]:
-                found[f"{name}/cells"] = _cell_sums(x, layout.cells[name])
-            else:
-                found[name] = x.reshape(-1, x.shape[-1])
-    return found
-
-
-def compressed(found: Mapping[str, Array], layout: Layout) -> dict[str, np.ndarray]:
-    """The arrays that go to disk: half precision with scales."""
-    stored: dict[str, np.ndarray] = {}
-    for name, value in found.items():
-        array = np.asarray(value, np.float32)
-        if layout.types[name] == "<f2":
-            axis = 1 if name.endswith("cells") else (0, 1)
-            scale = np.maximum(np.abs(array).max(axis=axis, keepdims=True), 1e-30)
-            stored[f"{name}/scale"] = scale.reshape(-1).astype("<f4")
-            array = array / scale
-        stored[name] = np.ascontiguousarray(array, layout.types[name])
-    return stored
-
-
-def _cell_sums(x: Float[Array, "h w n"], cell: int) -> Float[Array, "c m"]:
-    """Upper triangles of ``sum F F^T`` over the nodes of a pyramid of square cells."""
-    height, width, n = x.shape
-    x = jnp.pad(x, ((0, -height % cell), (0, -width % cell), (0, 0)))
-    rows, columns = x.shape[0] // cell, x.shape[1] // cell
-    upper = np.triu_indices(n)
-
-    def of_row(strip: Array) -> Array:
-        parts = strip.reshape(cell, columns, cell, n)
-        return jnp.einsum("ycxi,ycxj->cij", parts, parts)[:, upper[0], upper[1]]
-
-    sums = lax.map(of_row, x.reshape(rows, cell, columns * cell, n))
-    levels = [sums]
-    for rows, columns in pyramid_shapes((height, width), cell)[1:]:
-        odd = [(0, 2 * rows - sums.shape[0]), (0, 2 * columns - sums.shape[1]), (0, 0)]
-        sums = jnp.pad(sums, odd).reshape(rows, 2, columns, 2, -1).sum(axis=(1, 3))
-        levels.append(sums)
-    return jnp.concatenate([level.reshape(-1, level.shape[-1]) for level in levels])
 
 
 class _Layer(NamedTuple):
@@ -230,7 +95,8 @@ def prepare(
         )
     blocks = tuple(blocks_up_to(network, layout.cells))
     tiled = {name: network.kernels[name].shape[2] > 4 for block in blocks for name in block}
-    small = tuple(_blank_side(side, blocks) for side in visible.shape)
+    rows, columns = (_blank_side(side, blocks) for side in visible.shape)
+    small = (rows, columns)
     kept = {name: False for name in unwidened}
     work = plan(blocks, visible, layout.cells, tiled, small, kept)
     maps = _blank_maps(network, small, blocks)
