@@ -5,7 +5,6 @@ or not. Where the photo shows the skin, it says where: up to the frequency that 
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float
@@ -62,12 +61,3 @@ def low_pass(image: Float[Array, "h w"], blur: Float[Array, ""] | float) -> Floa
     fx = jnp.fft.rfftfreq(width + margin).astype(image.dtype)[None]
     transfer = jnp.exp(-2 * jnp.pi**2 * (fy**2 + fx**2) * jnp.asarray(blur, image.dtype) ** 2)
     return jnp.fft.irfft2(spectrum * transfer, padded.shape)[:height, :width].astype(image.dtype)
-
-
-def normalised_low_pass(
-    values: Float[Array, "h w c"], weight: Float[Array, "h w"], blur: Float[Array, ""] | float
-) -> Float[Array, "h w c"]:
-    """Blur where a weight says what counts: ``K(w v) / K(w)`` (Knutsson and Westin 1993)."""
-    total = low_pass(weight, blur)
-    blurred = jax.vmap(lambda v: low_pass(v * weight, blur), -1, -1)(values)
-    return blurred / jnp.maximum(total, 1e-4)[..., None]

@@ -20,10 +20,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
 from jaxface._types import Float
+from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.atomic import atomic_path
 from jaxface.io.cache import cache_dir
 from jaxface.io.exr import srgb_encoded
@@ -192,9 +194,7 @@ class TextureDatabase:
 
     def albedo(self, name: str) -> Float[np.ndarray, "r r 3"]:
         """A subject's albedo, linear RGB; raises as `encoded`."""
-        encoded = self.encoded(name)
-        curve = ((encoded + 0.055) / 1.055) ** 2.4
-        return np.where(encoded <= 0.04045, encoded / 12.92, curve).astype(np.float32)
+        return np.asarray(srgb_to_linear(jnp.asarray(self.encoded(name))))
 
     def is_whole(self, name: str) -> bool:
         """Whether a subject is listed and its file is an image of the right size."""

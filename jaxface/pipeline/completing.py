@@ -1,7 +1,8 @@
 """Partial albedo -> complete albedo: analysis, blending, synthesis (Saito 2017, secs. 4 to 6)."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,8 +87,7 @@ def complete(
     order = np.argsort(-blended.weights)
     used = [int(i) for i in order if abs(blended.weights[i]) > 1e-3]
     records: list[dict[str, Any]] = []
-    start = work.start(work.levels[0], used[0])
-    last = Level(np.zeros((0, 0), np.float32), {}, {})
+    start, last = np.zeros(0, np.float32), Level(np.zeros((0, 0), np.float32), {}, {})
     for index, level in enumerate(work.levels):
         start = work.start(level, used[0])
         done = resumed(level)
@@ -106,6 +106,18 @@ def complete(
         work.box(work.levels[-1]),
         records,
     )
+
+
+class _Maps(NamedTuple):
+    """What was seen, at one level."""
+
+    photo: Float[Array, "r r 3"]
+    """what the photo shows, sRGB-encoded"""
+    weight: Float[Array, "r r"]
+    """how far it is to be trusted"""
+    low_frequency: Float[Array, "r r 3"]
+    mask: Bool[np.ndarray, "r r"]
+    """texels to be synthesised"""
 
 
 class _Work:
@@ -137,6 +149,8 @@ class _Work:
         tile = even_tile((height, width)) if tiled else None
         self._grams = jax.jit(lambda net, image: grams(net, image, settings.layers, tile))
         self.tile = tile
+        # One level's alone: whole maps of every level would add up.
+        self.maps = functools.lru_cache(maxsize=1)(self._maps)
 
     def _texels(self, level: int) -> float:
         """Texels of a level for one pixel of the photo."""
@@ -150,23 +164,25 @@ class _Work:
     def cut(self, texture: Any, level: int) -> Any:
         return texture[self.box(level)]
 
-    def mask(self, level: int) -> Bool[np.ndarray, "h w"]:
-        return shrink(self.seen.free[..., None].astype(np.float32), level)[..., 0] > 0.5
-
-    def photo(self, level: int) -> tuple[Array, Array]:
-        """What the photo shows at a level, and how far it is to be trusted there."""
-        weight = shrink(self.seen.weight[..., None], level)
-        colour = shrink(self.seen.photo * self.seen.weight[..., None], level)
-        return jnp.asarray(colour / np.maximum(weight, 1e-3)), jnp.asarray(weight[..., 0])
+    def _maps(self, level: int) -> _Maps:
+        seen = self.seen
+        weight = shrink(seen.weight[..., None], level)
+        colour = shrink(seen.photo * seen.weight[..., None], level)
+        return _Maps(
+            jnp.asarray(colour / np.maximum(weight, 1e-3)),
+            jnp.asarray(weight[..., 0]),
+            jnp.asarray(shrink(seen.low_frequency, level)),
+            shrink(seen.free[..., None].astype(np.float32), level)[..., 0] > 0.5,
+        )
 
     def subject(self, index: int, level: int) -> Array:
         """A subject's texture at a level, on the photo's complexion if the settings say so."""
         texture = shrink(self.database.encoded(self.database.names[index]), level)
-        low = jnp.asarray(shrink(self.seen.low_frequency, level))
         if texture.shape[0] < level:
             texture = resize(jnp.asarray(texture), level, level)
         if not self.settings.match_complexion:
             return jnp.asarray(texture)
+        low = self.maps(level).low_frequency
         return with_complexion(jnp.asarray(texture), low, level * COMPLEXION)
 
     def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
@@ -179,11 +195,11 @@ class _Work:
         if isinstance(self.blending, Blend):
             return self.blending
         level, count = self.analysis_level, len(self.database)
-        photo, weight = self.photo(level)
-        mask = self.mask(level) & (np.asarray(weight) > 0.5)
+        seen = self.maps(level)
+        mask = seen.mask & (np.asarray(seen.weight) > 0.5)
         if mask.sum() < 100:
             raise ValueError("the photo shows next to no skin of the face that could be analysed")
-        target = self.statistics(photo, mask, level)
+        target = self.statistics(seen.photo, mask, level)
         stacks: dict[str, list[np.ndarray]] = {name: [] for name in target}
         for index in range(count):
             for name, value in self.statistics(self.subject(index, level), mask, level).items():
@@ -198,7 +214,7 @@ class _Work:
         # What was left out is made up for, so that the sum of the weights stays as it was.
         weights = blended.weights[used] * (blended.weights.sum() / blended.weights[used].sum())
         total: dict[str, Array] = {}
-        mask, carry = self.mask(level), self.settings.carry
+        mask, carry = self.maps(level).mask, self.settings.carry
         for share, index in zip(weights, used, strict=True):
             texture = self.subject(index, level)
             found = self.statistics(texture, mask, level)
@@ -212,17 +228,18 @@ class _Work:
 
     def gain(self, level: int, carry: float) -> float:
         """What the seen skin's departure counts: 1, or as if the whole face departed like it."""
-        weight = np.asarray(self.photo(level)[1])[self.mask(level)]
+        seen = self.maps(level)
+        weight = np.asarray(seen.weight)[seen.mask]
         return 1 + carry * min(1 / max(float(weight.mean()), 1e-3) - 1, LARGEST_GAIN - 1)
 
     def with_photo(self, texture: Array, level: int) -> Array:
         """A texture with the frequencies that the photo holds, where it is seen."""
-        return with_photo(texture, *self.photo(level), PHOTO_BLUR * self._texels(level))
+        seen = self.maps(level)
+        return with_photo(texture, seen.photo, seen.weight, PHOTO_BLUR * self._texels(level))
 
     def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
         """The texture before synthesis: whole, sRGB-encoded."""
-        low = jnp.asarray(shrink(self.seen.low_frequency, level))
-        texture = low
+        low = texture = self.maps(level).low_frequency
         if self.settings.start == "neighbour":
             texture = self.subject(nearest, level)
         texture = self.with_photo(texture, level)
@@ -243,14 +260,13 @@ class _Work:
         if coarser.size:
             lower = resize(first[..., None], *coarser.shape)
             first = first + resize(jnp.asarray(coarser)[..., None] - lower, *first.shape)[..., 0]
-        free = self.cut(self.mask(level), level)
-        photo, weight = self.photo(level)
-        low = rgb_to_yiq(jnp.asarray(shrink(self.seen.low_frequency, level)))[..., 0]
+        seen = self.maps(level)
+        free = self.cut(seen.mask, level)
         detail = shrink(self.seen.detail_map(self.settings.detail)[..., None], level)[..., 0]
         known = KnownDetail(
-            self.cut(rgb_to_yiq(photo)[..., 0], level),
-            self.cut(weight, level) * free,
-            self.cut(low, level),
+            self.cut(rgb_to_yiq(seen.photo)[..., 0], level),
+            self.cut(seen.weight, level) * free,
+            self.cut(rgb_to_yiq(seen.low_frequency)[..., 0], level),
             jnp.asarray(self.cut(detail, level)),
         )
         goal = self.targets(level, blended, used)
@@ -284,7 +300,7 @@ class _Work:
         """The synthesised intensity with the start's colour, in the start's surroundings."""
         level = len(start)
         box = self.box(level)
-        free = jnp.asarray(self.cut(self.mask(level), level))
+        free = jnp.asarray(self.cut(self.maps(level).mask, level))
         soft = soft_inside(free, max(level // 128, 2))
         colour = jnp.asarray(start[box])
         mixed = soft * intensity + (1 - soft) * rgb_to_yiq(colour)[..., 0]

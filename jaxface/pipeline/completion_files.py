@@ -46,7 +46,6 @@ def complete_folder(
     features: str = "random",
     resolution: int | None = None,
     settings: CompletionSettings | None = None,
-    iterations: int | None = None,
     model: str | os.PathLike[str] | None = None,
     on_step: OnStep = lambda what, done, of: None,
 ) -> Completed:
@@ -62,7 +61,6 @@ def complete_folder(
         features: name or file of the feature network, see `load_network`.
         resolution: texels along a side; as the partial albedo has by default.
         settings: see `CompletionSettings`.
-        iterations: in place of that of the settings.
         model: file of the model, where the fit is not of a bundled one.
         on_step: told of every step.
 
@@ -71,8 +69,6 @@ def complete_folder(
         ValueError: files are damaged or do not fit together.
     """
     place, settings = Path(folder), settings or CompletionSettings()
-    if iterations is not None:
-        settings = dataclasses.replace(settings, iterations=iterations)
     started = time.perf_counter()
     network = load_network(features)
     seen = read_seen_texture(place, resolution, model)
