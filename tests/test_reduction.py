@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.solvers.reduction import reduced, triangular_factor
+from jaxface.solvers.reduction import _turned, reduced, triangular_factor
 
 
 def block_reader(matrix, rows):
@@ -33,12 +33,28 @@ def columns(kind):
         matrix[5::50] += 1e3 * rng.normal(size=(40, 12))
     elif kind == "zero":
         matrix[:, 3] = 0.0
+    elif kind == "few long":
+        turn = np.linalg.qr(rng.normal(size=(12, 12)))[0]
+        matrix = matrix @ turn @ np.diag([1e5, 1e4] + 10 * [1.0]) @ turn.T
+    elif kind == "few long, misleading":
+        turn = np.linalg.qr(rng.normal(size=(12, 12)))[0]
+        matrix = matrix @ turn @ np.diag([1e5, 1e4] + 10 * [1.0]) @ turn.T
+        matrix[5::50] += 1e7 * rng.normal(size=(40, 12))
     elif kind == "short":
         matrix = matrix[:7]
     return matrix
 
 
-KINDS = ("plain", "ill-conditioned", "dependent", "misleading sample", "zero", "short")
+KINDS = (
+    "plain",
+    "ill-conditioned",
+    "dependent",
+    "misleading sample",
+    "few long",
+    "few long, misleading",
+    "zero",
+    "short",
+)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -54,6 +70,27 @@ def test_triangular_factor_keeps_lengths(kind, rows):
     # Backward stable: also short combinations are right to the rounding of the long ones.
     size = float(np.linalg.norm(matrix))
     np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-13 * size)
+
+
+def test_few_long_directions_are_turned_not_divided():
+    sample = next(iter(block_reader(columns("few long"), 5000)(None)))
+    form = _turned(sample @ sample.T)
+    assert form is not None
+    assert form.reflectors.shape == (12, 2)
+    orthogonal = np.eye(12) - form.returns @ form.reflectors.T
+    np.testing.assert_allclose(orthogonal @ orthogonal.T, np.eye(12), atol=1e-14)
+    lengths = np.linalg.norm(form.evened(sample), axis=1)
+    np.testing.assert_allclose(lengths[:2] / form.scales[:2], 1.0, rtol=1e-6)
+    assert np.all(lengths[2:] < 2 * form.scales[2:])
+    assert _turned(np.eye(12)) is None
+
+
+def test_threads_change_no_digit(monkeypatch):
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr("os.cpu_count", lambda threads=threads: threads)
+        found.append(triangular_factor(block_reader(columns("few long"), 97), 12))
+    np.testing.assert_array_equal(*found)
 
 
 def test_triangular_factor_refuses_nan():

@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxface._types import Float
 
-BLOCK_BYTES = 64 << 20
-"""memory of one block of columns in double precision"""
+BLOCK_BYTES = 8 << 20
+"""memory of one block of columns in double precision: small enough to be read again from cache"""
 
 
 def half_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -35,6 +35,7 @@ def blocks(
     count = sum(len(stack) for stack in matrices)
     stride = 1 if sample is None else max(1, n * (n + 1) // 2 // sample)
     wanted = max(1, BLOCK_BYTES // (8 * count))
+    off_diagonal = (2.0 * stride) ** 0.5 * scale
     lines = list(range(0, n, stride))
     while lines:
         taken, entries = [lines.pop(0)], 0
@@ -42,17 +43,16 @@ def blocks(
         while lines and entries + n - lines[0] <= wanted:
             entries += n - lines[0]
             taken.append(lines.pop(0))
-        rows = np.repeat(np.arange(len(taken)), [n - i for i in taken])
-        columns = np.concatenate([np.arange(i, n) for i in taken])
-        factor = scale * stride**0.5 * np.where(columns == np.array(taken)[rows], 1.0, 2.0**0.5)
-        span = slice(taken[0], taken[-1] + 1, stride)
-        columns -= taken[0]
-        block = np.empty((count, len(rows)))
+        block = np.empty((count, entries))
         first = 0
         for stack in matrices:
-            part = np.asarray(stack[:, span, taken[0] :])
-            np.multiply(part[:, rows, columns], factor, out=block[first : first + len(stack)])
-            first += len(stack)
+            last, at = first + len(stack), 0
+            for line in taken:
+                block[first:last, at : at + n - line] = stack[:, line, line:]
+                at += n - line
+            first = last
+        block *= off_diagonal
+        block[:, np.cumsum([0, *(n - line for line in taken[:-1])])] *= 0.5**0.5
         yield block
 
 

@@ -70,7 +70,7 @@ def blend(
 ) -> Blend:
     """Solve equation 2: ``min sum_l c_l ||sum_k w_k G_kl - G_l||_F`` over the simplex.
 
-    A memory-mapped database is read about once, in blocks of 64 MB. The answer has the
+    A memory-mapped database is read about once, in blocks. The answer has the
     precision of its input; relative gaps reach about 1e-11 from double and 1e-8 from single
     precision, and the answer says what it reached. For a gradient see `blend_weights`.
 
