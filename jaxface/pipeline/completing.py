@@ -32,6 +32,7 @@ from jaxface.stages.detail import (
     with_complexion,
     with_intensity,
     with_photo,
+    without_marks,
 )
 from jaxface.stages.synthesise import SynthesisProblem, synthesise
 
@@ -118,6 +119,7 @@ class _Maps(NamedTuple):
     low_frequency: Float[Array, "r r 3"]
     mask: Bool[np.ndarray, "r r"]
     """texels to be synthesised"""
+    plain: Float[Array, "r r"]
 
 
 class _Work:
@@ -173,6 +175,7 @@ class _Work:
             jnp.asarray(weight[..., 0]),
             jnp.asarray(shrink(seen.low_frequency, level)),
             shrink(seen.free[..., None].astype(np.float32), level)[..., 0] > 0.5,
+            jnp.asarray(shrink(seen.plain[..., None], level)[..., 0]),
         )
 
     def subject(self, index: int, level: int) -> Array:
@@ -182,8 +185,9 @@ class _Work:
             texture = resize(jnp.asarray(texture), level, level)
         if not self.settings.match_complexion:
             return jnp.asarray(texture)
-        low = self.maps(level).low_frequency
-        return with_complexion(jnp.asarray(texture), low, level * COMPLEXION)
+        seen = self.maps(level)
+        bare = without_marks(jnp.asarray(texture), seen.plain, level * COMPLEXION)
+        return with_complexion(bare, seen.low_frequency, level * COMPLEXION)
 
     def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
         """Gram matrices of a texture's intensity, masked out beyond a mask, in the box."""

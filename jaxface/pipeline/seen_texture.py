@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from jaxface._types import Bool, Float
 from jaxface.geometry.uv import UVLayout, uv_layout
@@ -16,9 +17,12 @@ from jaxface.io.fit_file import read_fit
 from jaxface.io.model_file import bundled_models
 from jaxface.io.models import load_model
 from jaxface.models.morphable import MorphableModel
+from jaxface.models.opening_rims import opening_rims
+from jaxface.models.skin.regions import skin_fields
 from jaxface.models.subdivide import subdivide
 from jaxface.stages.fit.prepared import FACE_REGIONS
 from jaxface.stages.low_frequency import low_frequency_albedo
+from jaxface.stages.plausible_skin import plausible_skin
 from jaxface.stages.symmetry import with_other_side
 
 NOT_SKIN = ("eyes", "mouth_interior")
@@ -41,6 +45,8 @@ class SeenTexture:
     """all skin, in the charts: not eyes, not the inside of the mouth"""
     inside: Bool[np.ndarray, "r r"]
     """the charts"""
+    plain: Float[np.ndarray, "r r"]
+    """1 on bare skin, 0 on brows, lids, lips, in nostrils and beards"""
     vertex_of: np.ndarray
     """(r, r) a vertex of each texel's triangle"""
 
@@ -86,10 +92,19 @@ def seen_texture(
             "square, 256 texels or more"
         )
     layout: UVLayout = uv_layout(model.uv, model.uv_faces, size)
+    rims = opening_rims(model)
+    calm = rims.calm(model.reflectance(jnp.asarray(coefficients)))
+    base = layout(calm, model.faces)
+    weight = np.asarray(weight) * _off_openings(
+        model, np.asarray(rims.pocket), layout, texels_per_pixel
+    )
+    dark = _may_be_dark(model, layout, np.asarray(albedo), weight, np.asarray(base))
+    kept, trusted = plausible_skin(
+        jnp.asarray(albedo), jnp.asarray(weight), base, jnp.asarray(dark)
+    )
     low = low_frequency_albedo(
-        *with_other_side(jnp.asarray(albedo), jnp.asarray(weight), model, layout),
-        model.reflectance(jnp.asarray(coefficients)), model.faces, layout,
-    )  # fmt: skip
+        *with_other_side(kept, trusted, model, layout), calm, model.faces, layout
+    )
     triangle = np.maximum(np.asarray(layout.triangle), 0)
     faces = np.asarray(model.faces)
     inside = np.asarray(layout.inside)
@@ -104,13 +119,14 @@ def seen_texture(
     face = within(*FACE_REGIONS) if model.region_names else inside
     return SeenTexture(
         model=model,
-        photo=srgb_encoded(np.asarray(albedo)),
-        weight=np.asarray(weight, np.float32),
+        photo=srgb_encoded(np.asarray(kept)),
+        weight=np.asarray(trusted, np.float32),
         low_frequency=srgb_encoded(np.asarray(low)),
         texels_per_pixel=texels_per_pixel,
         free=_largest_part(face),
         skin=inside & ~within(*NOT_SKIN),
         inside=inside,
+        plain=np.asarray(1 - np.clip(dark / 0.15, 0, 1), np.float32),
         vertex_of=faces[triangle, 0],
     )
 
@@ -158,6 +174,68 @@ def read_seen_texture(
     return seen_texture(
         finer, albedo, weight[..., 0], np.asarray(saved.parameters.albedo), scale * len(albedo)
     )
+
+
+def _off_openings(
+    model: MorphableModel,
+    pockets: Float[np.ndarray, "n"],
+    layout: UVLayout,
+    texels_per_pixel: float,
+) -> Float[np.ndarray, "r r"]:
+    """0 within a pixel and a half of the photo of the eyes' and the mouth's openings, 1 elsewhere.
+
+    Pixels there mix skin with teeth and eyeballs, and the smallest error of the fit makes them so.
+    """
+    pocket = pockets > 0
+    if "mouth_interior" in model.region_names:
+        pocket = pocket | np.asarray(model.region_mask("mouth_interior"))
+    values = layout(jnp.asarray(pocket, jnp.float32)[:, None], model.faces, 0.0)
+    opening = np.asarray(values)[..., 0] > 0
+    if not opening.any():
+        return np.ones(opening.shape, np.float32)
+    margin = 1.5 * texels_per_pixel + layout.resolution / 512
+    distance = np.asarray(distance_transform_edt(~opening))
+    t = np.clip(distance / margin - 1, 0, 1)
+    return np.asarray(t * t * (3 - 2 * t), np.float32)
+
+
+def _may_be_dark(
+    model: MorphableModel,
+    layout: UVLayout,
+    albedo: Float[np.ndarray, "r r 3"],
+    weight: Float[np.ndarray, "r r"],
+    base: Float[np.ndarray, "r r 3"],
+) -> Float[np.ndarray, "r r"]:
+    """How much darker than its surroundings skin may be, beyond what `plausible_skin` lets pass.
+
+    Brows, where the model has them, lids, lips and nostrils; and the beard, if the photo shows one.
+    """
+    known = model.region_names
+    smooth = np.zeros(model.vertex_count)
+    for name, amount in (("eyelids", 0.25), ("lips", 0.3)):
+        if name in known:
+            smooth = smooth + amount * np.asarray(model.region_mask(name))
+    if "nose" in known:
+        nose, luma = np.asarray(model.region_mask("nose")), np.asarray(model.albedo_mean).mean(-1)
+        smooth = smooth + 0.5 * nose * (luma < 0.7 * np.median(luma[nose]))
+    if model.landmarks68 is not None:
+        r = skin_fields(model).regions
+        beard, cheek = (np.asarray(layout(x[:, None], model.faces, 0.0))[..., 0] * weight
+                        for x in (r.beard, r.cheek))  # fmt: skip
+        ratio = np.log(np.maximum(albedo, 1e-3) / np.maximum(base, 1e-3)).mean(-1)
+        if beard.sum() > 0 and cheek.sum() > 0:
+            darker = np.average(ratio, weights=cheek) - np.average(ratio, weights=beard)
+            smooth = smooth + np.clip((darker - 0.1) / 0.25, 0, 1) * 0.8 * np.asarray(r.beard)
+        # Brows differ in height and width: wider than the model's own.
+        brow = np.asarray(layout(r.brow[:, None], model.faces, 0.0))[..., 0]
+        step = layout.resolution / 128
+        wide = np.clip(3 * gaussian_filter(brow, step), 0, 1)
+        # At the outline of what is seen it is hair of the head that hangs in.
+        outline = np.asarray(distance_transform_edt(~_largest_part(weight < 0.05)))
+        wide = wide * np.clip((outline / step - 1.5) / 3, 0, 1)
+    else:
+        wide = 0.0
+    return 3.0 * wide + np.asarray(layout(jnp.asarray(smooth[:, None]), model.faces, 0.0))[..., 0]
 
 
 def _largest_part(mask: Bool[np.ndarray, "r r"]) -> Bool[np.ndarray, "r r"]:

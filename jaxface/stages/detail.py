@@ -20,6 +20,12 @@ COMPLEXION = 1 / 128
 STRONGEST = 3.0
 """bound of ``I / K I`` and of its inverse"""
 
+MARK = (4.0, 6.0)
+"""depth of a mark, in units of the detail's spread around it: none below, whole above"""
+
+MARK_RIM = 6.0
+"""by how much a blurred mark is amplified, so that it covers the spot's rim too"""
+
 
 @jax.jit
 def with_complexion(
@@ -37,6 +43,48 @@ def with_complexion(
     smooth = _blurred(texture, blur)
     ratio = texture / jnp.maximum(smooth, 1e-3)
     return jnp.clip(low_frequency * jnp.clip(ratio, 1 / STRONGEST, STRONGEST), 0.0, 1.0)
+
+
+@jax.jit
+def without_marks(
+    texture: Float[Array, "h w c"],
+    plain: Float[Array, "h w"],
+    width: Float[Array, ""] | float,
+) -> Float[Array, "h w c"]:
+    """A texture without its moles: isolated spots far darker than the skin around varies.
+
+    A mark is one person's alone; statistics may be borrowed from a subject, its moles may not.
+    They are filled with the detail beside them. What lies dense (freckles, stubble, brows) is no
+    mark, nor is what is larger than ``width``.
+
+    Args:
+        texture: sRGB-encoded.
+        plain: where they are sought, 1 on bare skin, 0 on brows, nostrils, lips and lids.
+        width: standard deviation of the low-pass that marks stand out from, texels.
+    """
+    smooth = jnp.maximum(_blurred(texture, width), 1e-3)
+    ratio = texture / smooth
+    depth = -jnp.log(jnp.maximum(ratio.mean(-1), 1e-3))
+
+    def around(plane: Array, blur: Array | float) -> Array:
+        return jnp.maximum(_blurred(plane[..., None], blur)[..., 0], 0.0)
+
+    wide = 5.0 * jnp.asarray(width)
+    spread = jnp.sqrt(around(depth**2, wide))
+    # Once more without the marks themselves, or a large one would hide behind its own depth.
+    spread = jnp.sqrt(around(jnp.clip(depth, -2 * spread, 2 * spread) ** 2, wide))
+    deep = depth / (spread + 0.004)
+    # Dense ones are no marks; and the rim of one belongs to it.
+    dense = around(smoothstep(deep, 0.6 * MARK[0], MARK[0]), 1.6 * jnp.asarray(width))
+    mark = plain * smoothstep(deep, *MARK) * (1 - smoothstep(dense, 0.03, 0.06))
+    mark = jnp.clip(MARK_RIM * around(mark, width / 5), 0.0, 1.0)[..., None]
+    filled, whole = ratio, mark
+    for step in ((1, 0), (0, 1), (-1, -1)):
+        shift = jnp.round(2.0 * jnp.asarray(width) * jnp.array(step)).astype(jnp.int32)
+        other, hidden = (jnp.roll(x, shift, (0, 1)) for x in (ratio, mark))
+        use = whole * (1 - hidden)
+        filled, whole = filled + use * (other - filled), whole * hidden
+    return jnp.clip(smooth * filled, 0.0, 1.0)
 
 
 @jax.jit

@@ -11,6 +11,7 @@ from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_neighbours, vertex_normals
 from jaxface.imaging.colour import LUMINANCE
 from jaxface.models.morphable import MorphableModel
+from jaxface.models.opening_rims import OpeningRims, opening_rims
 
 NOT_SKIN = ("eyes", "mouth_interior")
 RIM_RINGS = 5
@@ -48,6 +49,8 @@ class SkinFields(eqx.Module):
     spacing: Float[Array, "n"]
     """mm per unit of UV, the geometric mean over directions"""
     landmarks: Float[Array, "68 3"]
+    rims: OpeningRims
+    """of eyes and mouth"""
 
 
 def skin_fields(model: MorphableModel) -> SkinFields:
@@ -77,6 +80,7 @@ def skin_fields(model: MorphableModel) -> SkinFields:
         regions=Regions(**{k: jnp.asarray(v, jnp.float32) for k, v in regions.items()}),
         spacing=jnp.asarray(_spacing(model, position), jnp.float32),
         landmarks=jnp.asarray(marks, jnp.float32),
+        rims=opening_rims(model),
     )
 
 

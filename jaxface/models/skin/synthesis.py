@@ -20,7 +20,7 @@ from jaxface.models.skin.patch import SkinPatch, patch_at
 from jaxface.models.skin.pigments import Density, absorb
 from jaxface.models.skin.pores import pores
 from jaxface.models.skin.regions import SkinFields, skin_fields
-from jaxface.models.skin.rows import Vector, smoothstep
+from jaxface.models.skin.rows import Vector
 from jaxface.models.skin.wrinkles import wrinkles
 
 Layer = Callable[[SkinPatch, SkinAttributes, Int[Array, ""]], Density]
@@ -98,14 +98,14 @@ def base_albedo(
     """The model's mean albedo with the subject's tone, and cleaner lips and lids.
 
     The first mode, overall darkness, is left to the pigments. Averaged textures mix teeth and
-    shadow into the lips, whose colour is drawn together here, and paint the inside of the lids
-    in a plain red, which becomes a flushed skin.
+    shadow into the lips, whose colour is drawn together here; for their rims and the lids' see
+    `models.opening_rims`.
     """
     modes = min(model.albedo.count - 1, attributes.tone.shape[0])
     tone = jnp.zeros(model.albedo.count)
     if modes > 0:
         tone = tone.at[1 : 1 + modes].set(attributes.tone[:modes])
-    albedo = jnp.clip(model.reflectance(tone), 0.004, 1.0)
+    albedo = jnp.clip(fields.rims.calm(model.reflectance(tone)), 0.004, 1.0)
     r = fields.regions
 
     def mean_over(weight: Float[Array, "n"]) -> Float[Array, "3"]:
@@ -113,10 +113,7 @@ def base_albedo(
 
     lip, cheek = mean_over(r.lips * (r.lips > 0.9)), mean_over(r.cheek)
     pale = 0.2 + 0.3 * attributes.male
-    albedo = albedo + (0.8 * r.lips)[:, None] * ((1 - pale) * lip + pale * cheek - albedo)
-    redness = albedo[:, 0] / albedo[:, 1] - cheek[0] / cheek[1]
-    sore = smoothstep(redness, 0.3, 1.0) * (1 - r.lips) * r.skin
-    return albedo + (0.85 * sore)[:, None] * (jnp.array([0.8, 0.68, 0.66]) * cheek - albedo)
+    return albedo + (0.8 * r.lips)[:, None] * ((1 - pale) * lip + pale * cheek - albedo)
 
 
 def _skin(patch: SkinPatch, base: Vector, traits: SkinAttributes, seed: Int[Array, ""]) -> Vector:

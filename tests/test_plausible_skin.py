@@ -1,0 +1,107 @@
+"""What is taken out of a partial albedo, and the rims of eyes and mouth."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface.io.models import load_model
+from jaxface.models.opening_rims import opening_rims
+from jaxface.stages.detail import without_marks
+from jaxface.stages.plausible_skin import TONE, plausible_skin
+
+SIDE = 256
+ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE] + 0.5
+
+
+def disc(row: float, column: float, radius: float) -> np.ndarray:
+    """1 within a disc with a rim of one texel."""
+    return np.clip(radius + 0.5 - np.hypot(ROWS - row, COLUMNS - column), 0, 1)[..., None]
+
+
+SKIN = np.broadcast_to(np.array([0.45, 0.28, 0.2]), (SIDE, SIDE, 3))
+PLAIN = np.zeros((SIDE, SIDE), np.float32)
+
+
+def cleaned(albedo, dark=PLAIN, weight=None):
+    weight = np.ones((SIDE, SIDE), np.float32) if weight is None else weight
+    found = plausible_skin(*(jnp.asarray(x, jnp.float32) for x in (albedo, weight, SKIN, dark)))
+    return tuple(np.asarray(x) for x in found)
+
+
+def log_ratio(albedo):
+    return np.log(albedo / SKIN).mean(-1)
+
+
+def test_plain_skin_and_its_pores_stay():
+    pores = 1 - 0.15 * (np.random.default_rng(0).uniform(size=(SIDE, SIDE, 1)) > 0.9)
+    albedo, weight = cleaned(SKIN * pores)
+    change = log_ratio(albedo) - np.log(pores[..., 0])
+    assert np.abs(change).mean() < 0.01 and np.abs(change).max() < 0.1
+    np.testing.assert_allclose(weight, 1, atol=1e-3)
+
+
+def test_gloss_and_folds_are_bounded_and_hair_is_not_trusted():
+    gloss, fold, hair = disc(60, 60, 4), disc(60, 190, 4), disc(190, 128, 5)
+    albedo = SKIN * np.exp(0.5 * gloss - 0.4 * fold - 2.0 * hair) + 0.1 * gloss
+    found, weight = cleaned(albedo)
+    before, after = log_ratio(albedo), log_ratio(found)
+    assert before[60, 60] > 0.6 and after[60, 60] < 3 * TONE
+    assert before[60, 190] < -0.35 and after[60, 190] > 0.65 * before[60, 190]
+    assert weight[190, 128] < 0.05 and weight[128, 128] > 0.95
+    # The highlight has lost its whiteness, too.
+    white = np.log(found[60, 60] / SKIN[60, 60])
+    assert white[2] - white[0] < 0.5 * np.log(albedo[60, 60] / SKIN[60, 60])[[2, 0]] @ [1, -1]
+
+
+def test_what_may_be_dark_stays_dark():
+    brow = disc(128, 128, 6)
+    albedo = SKIN * np.exp(-0.8 * brow)
+    kept, weight = cleaned(albedo, dark=10 * brow[..., 0])
+    lost, _ = cleaned(albedo)
+    assert log_ratio(kept)[128, 128] < -0.7 and weight[128, 128] > 0.9
+    assert log_ratio(lost)[128, 128] > log_ratio(kept)[128, 128] + 0.2
+
+
+def test_nothing_is_read_where_nothing_is_seen():
+    weight = (COLUMNS < 128).astype(np.float32)
+    albedo = np.where(weight[..., None] > 0, SKIN, 0.0)
+    found, trusted = cleaned(albedo, weight=weight)
+    np.testing.assert_allclose(found[:, :128], SKIN[:, :128], rtol=0.02)
+    assert trusted[:, 129:].max() == 0 and np.isfinite(found).all()
+    skin, dark = jnp.asarray(SKIN, jnp.float32), jnp.asarray(PLAIN)
+    slope = jax.grad(lambda x: plausible_skin(x, jnp.asarray(weight), skin, dark)[0].sum())(skin)
+    assert np.isfinite(np.asarray(slope)).all()
+
+
+def test_moles_go_and_freckles_stay():
+    rng = np.random.default_rng(1)
+    grain = np.exp(0.02 * rng.standard_normal((SIDE, SIDE, 1)))
+    mole = disc(100, 100, 1.5)
+    places = rng.uniform(170, 250, (300, 2))
+    dots = np.sum([disc(row, column, 0.8) for row, column in places], axis=0)
+    texture = np.clip(0.6 * grain * np.exp(-0.6 * mole - 0.3 * np.minimum(dots, 1)), 0, 1)
+    texture = jnp.asarray(np.repeat(texture, 3, axis=2), jnp.float32)
+    everywhere = jnp.ones((SIDE, SIDE))
+    found = np.asarray(without_marks(texture, everywhere, 5.0))
+    texture = np.asarray(texture)
+    assert texture[99:101, 99:101].mean() < 0.4 and found[99:101, 99:101].mean() > 0.54
+    freckled = slice(190, 230), slice(190, 230)
+    assert found[freckled].std() > 0.9 * texture[freckled].std()
+    held = np.asarray(without_marks(jnp.asarray(texture), 0 * everywhere, 5.0))
+    np.testing.assert_allclose(held, texture, atol=1e-5)
+
+
+def test_pockets_of_the_lids_and_rims_of_the_lips_are_calm():
+    model = load_model("makehuman")
+    rims = opening_rims(model)
+    before = np.asarray(model.albedo_mean)
+    after = np.asarray(rims.calm(model.albedo_mean))
+    lids, cheeks = (np.asarray(model.region_mask(name)) for name in ("eyelids", "cheeks"))
+    assert (before[lids, 0] / before[lids, 1]).max() > 4
+    assert (after[lids, 0] / after[lids, 1]).max() < 3
+    np.testing.assert_allclose(after[cheeks], before[cheeks], atol=1e-6)
+    assert 0.02 < np.asarray(rims.pocket)[lids].mean() < 0.5
+    bare = dataclasses.replace(model, region_names=(), region=jnp.zeros_like(model.region))
+    np.testing.assert_allclose(opening_rims(bare).calm(bare.albedo_mean), before, atol=1e-6)
