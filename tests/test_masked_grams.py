@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from jaxface.energies.gram import grams, mask_out
+from jaxface.io.texture_database import Subject
 from jaxface.models.random_features import random_network
-from jaxface.pipeline.gram_database import intensity, masked_grams, precompute
+from jaxface.pipeline.gram_database import (
+    bytes_to_precompute,
+    find_precomputed,
+    intensity,
+    masked_grams,
+    precompute,
+)
 from jaxface.stages.masked_grams import compressed, layout, masked_grams_of, prepare, store
 
 LAYERS = ("conv1_1", "conv2_1", "conv2_2", "conv3_1")
@@ -57,6 +64,9 @@ class Textures:
 
     def __init__(self, path):
         self.path, self.reads = path, []
+        self.subjects = [Subject(name, f"{name}.png", "CC0-1.0") for name in self.names]
+        for subject in self.subjects:
+            (path / subject.file).write_bytes(b"texture")
 
     def __len__(self):
         return len(self.names)
@@ -100,6 +110,51 @@ def test_cache_is_resumed_and_mended(tmp_path):
             assert error < TOLERANCE, (layer, error)
     other = precompute(database, random_network(SHAPE, seed=4), 32, layers=LAYERS)
     assert not set(other.keys) & set(cache.keys)
+
+
+def test_only_what_changed_is_read_again(tmp_path):
+    network = random_network(SHAPE, seed=3)
+    database = Textures(tmp_path)
+    known = cast(Any, database)
+    assert find_precomputed(known, network, 32, layers=LAYERS) is None
+    cache = precompute(known, network, 32, layers=LAYERS)
+    size = bytes_to_precompute(known, network, 32, LAYERS)
+    assert size == sum(cache.files.file(key).stat().st_size for key in cache.keys)
+    database.reads.clear()
+    found = find_precomputed(known, network, 32, layers=LAYERS)
+    assert found is not None and found.keys == cache.keys
+    assert find_precomputed(known, network, 64, layers=LAYERS) is None
+    precompute(known, network, 32, layers=LAYERS)
+    assert not database.reads
+    (tmp_path / "a.png").write_bytes(b"another texture")
+    assert find_precomputed(known, network, 32, layers=LAYERS) is None
+    precompute(known, network, 32, layers=LAYERS)
+    assert database.reads == ["a"]
+
+
+def test_older_files_make_room(tmp_path):
+    database = cast(Any, Textures(tmp_path))
+    first = precompute(database, random_network(SHAPE, seed=3), 32, layers=LAYERS)
+    room = 3 * first.files.bytes_per_texture
+    second = precompute(
+        database, random_network(SHAPE, seed=4), 32, layers=LAYERS, maximum_bytes=room
+    )
+    assert all(second.files.is_whole(key) for key in second.keys)
+    assert [first.files.is_whole(key) for key in first.keys] == [False, True]
+
+
+def test_one_mask_after_another_in_one_workspace():
+    """Rows of an earlier texture must not show in a later one."""
+    network = random_network(SHAPE, seed=3)
+    plan = layout(network, (64, 48), LAYERS)
+    visible = masks(64, 48)["disc"]
+    prepared = prepare(network, visible, plan)
+    for seed in (1, 2, 1):
+        image = jnp.asarray(np.random.default_rng(seed).random((64, 48)), jnp.float32)
+        found = masked_grams_of(prepared, compressed(store(network, image, plan), plan))
+        for layer, value in direct(network, image, jnp.asarray(visible)).items():
+            error = np.linalg.norm(found[layer] - value) / np.linalg.norm(value)
+            assert error < TOLERANCE, (seed, layer, error)
 
 
 def test_bad_arguments_are_named(tmp_path):

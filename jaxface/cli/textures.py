@@ -160,6 +160,38 @@ def database_import_scan(
     console.print(f"wrote [bold]{out}[/bold]")
 
 
+@database_app.command("precompute")
+def database_precompute(
+    path: Annotated[Path, typer.Argument(help="Folder of a database.")],
+    features: FeaturesOption = "random",
+    resolution: Annotated[
+        int | None,
+        typer.Option("--resolution", help="Texels along a side; as photos are compared at."),
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", help="GB that the cache may hold; the oldest files go.")
+    ] = 64,
+) -> None:
+    """Keep what makes comparing a photo with the textures fast; goes on where it stopped."""
+    from jaxface.io.feature_weights import load_network
+    from jaxface.io.texture_database import TextureDatabase
+    from jaxface.pipeline.completing import ANALYSIS
+    from jaxface.pipeline.gram_database import bytes_to_precompute, precompute
+
+    with errors():
+        database = TextureDatabase(path)
+        side = min(ANALYSIS, database.resolution) if resolution is None else resolution
+        network = load_network(features)
+        size = bytes_to_precompute(database, network, side)
+        console.print(f"{len(database)} textures of {side} texels take {size / 1e9:.3g} GB")
+        with steps(f"statistics of {path}") as on_step:
+            cache = precompute(
+                database, network, side, lambda done, of: on_step("textures", done, of),
+                maximum_bytes=round(limit * 1e9),
+            )  # fmt: skip
+    console.print(f"{len(cache.keys)} textures in [bold]{cache.files.path}[/bold]")
+
+
 @features_app.command("info")
 def features_info(
     source: Annotated[str, typer.Argument(help="random, trained, vgg16, vgg19, or a file.")],

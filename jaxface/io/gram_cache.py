@@ -9,7 +9,7 @@ import hashlib
 import math
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +99,15 @@ class GramCache:
             )
             for name, shape in self.shapes.items()
         }
+
+    def prune(self, keys: Collection[str], maximum_bytes: int) -> None:
+        """Remove the oldest files of other keys until the folder holds no more than allowed."""
+        held = [(p.stat().st_mtime, p.stat().st_size, p) for p in self.path.glob("*.grams")]
+        total = sum(size for _, size, _ in held)
+        for _, size, path in sorted(held):
+            if total > maximum_bytes and path.stem not in keys:
+                path.unlink(missing_ok=True)
+                total -= size
 
 
 def digest(*parts: str | bytes | np.ndarray | Array) -> str:

@@ -3,7 +3,8 @@
 A response whose receptive field is all visible is that of the unmasked image; one whose receptive
 field is all masked is that of a constant image. Between the two lies a band along the mask's
 outline, the wider the deeper the layer: one pixel more on either side for every 3x3 convolution.
-Only the band is computed again, from the cached responses of the last pooling around it.
+Only the band is computed again, layer by layer; around it stand cached responses of the texture
+and those of the constant image.
 
 Everything here depends on the mask and the network's shape alone, not on an image.
 """
@@ -24,7 +25,7 @@ _SQUARE = np.ones((3, 3), bool)
 
 
 class Reach(NamedTuple):
-    """Pixels of a layer's map (h, w) by what their receptive field sees; the rest sees both."""
+    """Pixels of a map (h, w) by what their receptive field sees; the rest sees both."""
 
     clear: Bool[np.ndarray, "h w"]
     """only visible pixels"""
@@ -37,65 +38,62 @@ class Reach(NamedTuple):
         return ~(self.clear | self.blank)
 
 
-class Work(NamedTuple):
-    """What has to be computed of one layer, as places in flat maps.
+class Table(NamedTuple):
+    """The pixels of one map that are needed, as rows of channels.
 
-    A *table* holds one row of channels for each computed pixel; row 0 is zero.
+    Row 0 is zero. The rows computed from those of the map before follow, then rows of the
+    constant image, then cached ones. Maps are the layers, and each block's input ``poolB``.
     """
 
-    sources: Int[np.ndarray, "36 t"]
-    """of the first layers ``9 t``: rows of the input's table, for each tile of outputs"""
-    counted: Int[np.ndarray, "m"]
-    """rows of the layer's own table that count in its Gram matrix"""
-
-
-class Splice(NamedTuple):
-    """The input of a block, pieced together: rows 1 .. of its table in this order.
-
-    Zeros (row 0), the constant image's responses, cached responses, pooled fresh ones.
-    """
-
+    name: str
+    sources: Int[np.ndarray, "s t"]
+    """rows of the table before: 36 of a 6x6 patch for each tile of 4x4 computed pixels (first all
+    tiles' first pixels, then their second ones, ...), 9 for each single pixel, or the 4 of a
+    pooled one; 0 rows for the image itself"""
     blank: Int[np.ndarray, "a"]
-    """places in the constant image's small map"""
+    """places in the constant image's small map (see `blank_place`)"""
     cached: Int[np.ndarray, "b"]
     """places in the texture's full map"""
-    fresh: Int[np.ndarray, "4 c"]
-    """rows of the table of the layer before the pooling"""
+    counted: Int[np.ndarray, "m"]
+    """rows, all computed ones, that count in the layer's Gram matrix"""
+
+    @property
+    def computed(self) -> int:
+        """Number of computed rows."""
+        return self.sources.shape[1] * (TILE**2 if len(self.sources) == 36 else 1)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return 1 + self.computed + len(self.blank) + len(self.cached)
 
 
 class Plan(NamedTuple):
     """All work for one mask."""
 
-    works: dict[str, Work]
-    splices: tuple[Splice, ...]
-    """of each block's input; of the first, the image itself"""
+    tables: tuple[Table, ...]
+    """from the image on"""
     reaches: dict[str, Reach]
     """of the layers asked for"""
 
 
-def reaches(
-    blocks: Sequence[Sequence[str]], visible: Bool[np.ndarray, "h w"], kept: Mapping[str, bool]
-) -> tuple[dict[str, Reach], list[Reach]]:
-    """What every layer, and every block's input, sees of a mask.
+def maps_of(blocks: Sequence[Sequence[str]]) -> list[str]:
+    """Names of all maps in order: each block's input ``poolB``, then its layers."""
+    return [name for index, block in enumerate(blocks) for name in (f"pool{index}", *block)]
 
-    Args:
-        blocks: names of the layers of each block.
-        visible: pixels of the image.
-        kept: layers for which False is given are taken not to widen the band.
-    """
+
+def reaches(blocks: Sequence[Sequence[str]], visible: Bool[np.ndarray, "h w"]) -> dict[str, Reach]:
+    """What the pixels of every map see of a mask."""
     clear, blank = visible, ~visible
-    layers: dict[str, Reach] = {}
-    inputs: list[Reach] = []
-    for index, block in enumerate(blocks):
-        if index:
+    found: dict[str, Reach] = {}
+    for index, name in enumerate(maps_of(blocks)):
+        if name.startswith("pool") and index:
             clear, blank = _all_of_cell(clear), _all_of_cell(blank)
-        inputs.append(Reach(clear, blank))
-        for name in block:
-            if kept.get(name, True):
-                clear = binary_erosion(clear, _SQUARE, border_value=1)
-                blank = binary_erosion(blank, _SQUARE, border_value=1)
-            layers[name] = Reach(clear, blank)
-    return layers, inputs
+        elif index:
+            clear = binary_erosion(clear, _SQUARE, border_value=1)
+            blank = binary_erosion(blank, _SQUARE, border_value=1)
+        found[name] = Reach(clear, blank)
+    return found
 
 
 def _all_of_cell(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
@@ -110,6 +108,14 @@ def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a
     padded = np.pad(mask, ((0, -height % cell), (0, -width % cell)), constant_values=True)
     rows, columns = padded.shape[0] // cell, padded.shape[1] // cell
     return np.asarray(padded.reshape(rows, cell, columns, cell).all(axis=(1, 3)))
+
+
+def beside_whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "h w"]:
+    """The true pixels that lie in no cell that is true throughout; all true ones for ``cell`` 0."""
+    if not cell:
+        return mask
+    whole = whole_cells(mask, cell).repeat(cell, axis=0).repeat(cell, axis=1)
+    return mask & ~whole[: mask.shape[0], : mask.shape[1]]
 
 
 def clear_nodes(mask: Bool[np.ndarray, "h w"], cell: int) -> Int[np.ndarray, "n"]:
@@ -140,9 +146,9 @@ def plan(
     blocks: Sequence[Sequence[str]],
     visible: Bool[np.ndarray, "h w"],
     cells: Mapping[str, int],
+    cached: Mapping[str, bool],
     tiled: Mapping[str, bool],
     blank_shape: tuple[int, int],
-    kept: Mapping[str, bool],
 ) -> Plan:
     """Everything that has to be computed again for a mask.
 
@@ -150,114 +156,103 @@ def plan(
         blocks: names of the layers of each block.
         visible: pixels of the image.
         cells: of each layer whose Gram matrix is wanted, the side of the cells whose sums are
-            cached (pixels of the layer's map), or 0 where its responses are cached.
+            cached (pixels of the layer's map), or 0 where none are.
+        cached: of each layer, whether its responses to the texture are cached; and of a block's
+            input ``poolB`` where it is not.
         tiled: by layer, whether it is computed in 4x4 tiles or pixel by pixel.
         blank_shape: of the small constant image (see `blank_place`).
-        kept: see `reaches`.
     """
-    seen, inputs = reaches(blocks, visible, kept)
-    needed, wanted_inputs = _needed(blocks, seen, inputs, cells)
-    works: dict[str, Work] = {}
-    splices: list[Splice] = []
-    rows = np.zeros(0, np.intp)
-    for index, block in enumerate(blocks):
-        shape = inputs[index].clear.shape
-        small = (blank_shape[0] >> index, blank_shape[1] >> index)
-        above = inputs[max(index - 1, 0)].clear.shape[1]
-        rows, splice = _splice(wanted_inputs[index], inputs[index], rows, above, small)
-        splices.append(splice)
-        for name in block:
-            if tiled[name]:
-                y, x = covering_tiles(needed[name])
-                side = TILE
-            else:
-                y, x = np.nonzero(needed[name])
-                side = 1
-            offsets = np.arange(-1, side + 1)
-            patch_y = (y[None, None] + offsets[:, None, None]) + 0 * offsets[None, :, None]
-            patch_x = (x[None, None] + offsets[None, :, None]) + 0 * offsets[:, None, None]
-            ok = (patch_y >= 0) & (patch_y < shape[0]) & (patch_x >= 0) & (patch_x < shape[1])
-            place = np.where(ok, patch_y * shape[1] + patch_x, 0)
-            sources = np.where(ok, rows.reshape(-1)[place], 0).reshape(len(offsets) ** 2, -1)
-            inner = slice(1, side + 1)
-            rows = np.zeros(shape[0] * shape[1], np.intp)
-            numbers = 1 + np.arange(side * side * len(y), dtype=np.intp)
-            numbers = numbers.reshape(side, side, len(y))
-            rows[place[inner, inner][ok[inner, inner]]] = numbers[ok[inner, inner]]
-            counted = np.zeros(0, np.intp)
-            if name in cells:
-                counted = rows[np.flatnonzero(_counted(seen[name], cells[name]))]
-            works[name] = Work(sources, counted)
-    return Plan(works, tuple(splices), {name: seen[name] for name in cells})
+    seen = reaches(blocks, visible)
+    wanted = _wanted(blocks, seen, cells, cached)
+    tables: list[Table] = []
+    rows, width = np.zeros(0, np.intp), 0
+    block = -1
+    for name in maps_of(blocks):
+        reach, (need, computed) = seen[name], wanted[name]
+        block += name.startswith("pool")
+        if name.startswith("pool"):
+            sources, places = _pooling(computed, rows, width)
+        else:
+            sources, places = _patches(computed, rows, tiled[name])
+        blank = np.flatnonzero(need & reach.blank & ~computed)
+        whole = np.flatnonzero(need & reach.clear & ~computed)
+        rows, width = np.zeros(need.size, np.intp), need.shape[1]
+        inside = places >= 0
+        rows[places[inside]] = 1 + np.flatnonzero(inside)
+        # A tile's other pixels may lack their sources; what is known stands instead of them.
+        rows[blank] = 1 + places.size + np.arange(len(blank))
+        rows[whole] = 1 + places.size + len(blank) + np.arange(len(whole))
+        counted = np.zeros(0, np.intp)
+        if name in cells:
+            counted = rows[np.flatnonzero(_counted(reach, cells[name], cached[name]))]
+        small = (blank_shape[0] >> block, blank_shape[1] >> block)
+        tables.append(Table(name, sources, blank_place(blank, need.shape, small), whole, counted))
+    return Plan(tuple(tables), {name: seen[name] for name in cells})
 
 
-def _counted(reach: Reach, cell: int) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose responses have to be known: mixed, or clear in a cell that is not all clear."""
-    if not cell:
+def _counted(reach: Reach, cell: int, cached: bool) -> Bool[np.ndarray, "h w"]:
+    """Pixels to be computed for a Gram matrix: mixed, or clear ones that nothing cached holds."""
+    if cached:
         return reach.mixed
-    whole = whole_cells(reach.clear, cell).repeat(cell, axis=0).repeat(cell, axis=1)
-    height, width = reach.clear.shape
-    return ~reach.blank & ~whole[:height, :width]
+    return reach.mixed | beside_whole_cells(reach.clear, cell)
 
 
-def _needed(
+def _wanted(
     blocks: Sequence[Sequence[str]],
     seen: Mapping[str, Reach],
-    inputs: Sequence[Reach],
     cells: Mapping[str, int],
-) -> tuple[dict[str, Bool[np.ndarray, "h w"]], list[Bool[np.ndarray, "h w"]]]:
-    """Pixels needed of every layer and of every block's input, from the last layer back."""
-    needed: dict[str, np.ndarray] = {}
-    wanted_inputs: list[np.ndarray] = []
-    behind: np.ndarray | None = None  # needed of this block's last layer by the next block
-    for index in reversed(range(len(blocks))):
-        need = behind if behind is not None else np.zeros(inputs[index].clear.shape, bool)
-        for name in reversed(blocks[index]):
-            if name in cells:
-                need = need | _counted(seen[name], cells[name])
-            needed[name] = need
-            need = binary_dilation(need, _SQUARE)
-        wanted_inputs.insert(0, need)
-        if index:
-            fresh = (need & inputs[index].mixed).repeat(2, axis=0).repeat(2, axis=1)
-            behind = np.zeros(inputs[index - 1].clear.shape, bool)
-            behind[: fresh.shape[0], : fresh.shape[1]] = fresh
-    return needed, wanted_inputs
+    cached: Mapping[str, bool],
+) -> dict[str, tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]]:
+    """Of every map the pixels needed, and those of them to be computed, from the last one back."""
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    names = maps_of(blocks)
+    need = np.zeros_like(seen[names[-1]].clear)
+    for name, before in zip(reversed(names), [*reversed(names[:-1]), ""], strict=True):
+        reach, pooled = seen[name], name.startswith("pool")
+        if name in cells:
+            need = need | _counted(reach, cells[name], cached[name])
+        computed = need & (reach.mixed if cached.get(name, pooled) else ~reach.blank)
+        found[name] = need, computed
+        if not before:
+            break
+        if pooled:
+            fresh = computed.repeat(2, axis=0).repeat(2, axis=1)
+            need = np.zeros_like(seen[before].clear)
+            need[: fresh.shape[0], : fresh.shape[1]] = fresh
+        else:
+            need = binary_dilation(computed, _SQUARE)
+    return found
 
 
-def _splice(
-    wanted: Bool[np.ndarray, "h w"],
-    reach: Reach,
-    before: Int[np.ndarray, "p"],
-    above: int,
-    small: tuple[int, int],
-) -> tuple[Int[np.ndarray, "q"], Splice]:
-    """Rows of a block's input by place, and where they come from.
+def _patches(
+    computed: Bool[np.ndarray, "h w"], rows: Int[np.ndarray, "p"], tiled: bool
+) -> tuple[Int[np.ndarray, "s t"], Int[np.ndarray, "q"]]:
+    """Sources of a layer's computed pixels, and the places of its rows (-1: outside the map)."""
+    height, width = computed.shape
+    y, x = covering_tiles(computed) if tiled else np.nonzero(computed)
+    offsets = np.arange(-1, (TILE if tiled else 1) + 1)
+    patch_y = (y[None, None] + offsets[:, None, None]) + 0 * offsets[None, :, None]
+    patch_x = (x[None, None] + offsets[None, :, None]) + 0 * offsets[:, None, None]
+    inside = (patch_y >= 0) & (patch_y < height) & (patch_x >= 0) & (patch_x < width)
+    place = np.where(inside, patch_y * width + patch_x, -1)
+    sources = np.where(inside, rows[np.maximum(place, 0)], 0)
+    return sources.reshape(len(offsets) ** 2, -1), place[1:-1, 1:-1].reshape(-1)
 
-    Args:
-        wanted: pixels of the input that have to be known.
-        reach: what they see.
-        before: rows of the table of the layer before the pooling, by place.
-        above: width of that layer's map.
-        small: the constant image's map.
-    """
-    height, width = wanted.shape
-    blank = np.flatnonzero(wanted & reach.blank & ~reach.clear)
-    cached = np.flatnonzero(wanted & reach.clear)
-    mixed = np.flatnonzero(wanted & reach.mixed)
-    rows = np.zeros(height * width, np.intp)
-    order = np.concatenate([blank, cached, mixed])
-    rows[order] = 1 + np.arange(len(order))
-    fresh = np.zeros((4, 0), np.intp)
-    if len(mixed):
-        y, x = np.divmod(mixed, width)
-        places = [(2 * y + dy) * above + 2 * x + dx for dy in (0, 1) for dx in (0, 1)]
-        fresh = np.stack([before[place] for place in places])
-    return rows, Splice(blank_place(blank, (height, width), small), cached, fresh)
+
+def _pooling(
+    computed: Bool[np.ndarray, "h w"], rows: Int[np.ndarray, "p"], above: int
+) -> tuple[Int[np.ndarray, "4 t"], Int[np.ndarray, "t"]]:
+    """The same for the pooled pixels of a block's input; ``above``: width of the map before."""
+    places = np.flatnonzero(computed)
+    y, x = np.divmod(places, computed.shape[1])
+    corners = [(2 * y + dy) * above + 2 * x + dx for dy in (0, 1) for dx in (0, 1)]
+    if not len(places):
+        return np.zeros((4, 0), np.intp), places
+    return np.stack([rows[corner] for corner in corners]), places
 
 
 def blank_place(
-    places: Int[np.ndarray, "n"], shape: tuple[int, int], small: tuple[int, int]
+    places: Int[np.ndarray, "n"], shape: tuple[int, ...], small: tuple[int, int]
 ) -> Int[np.ndarray, "n"]:
     """Where a small constant image responds as a large one does at given places of a map.
 

@@ -14,8 +14,8 @@ from jax import lax
 from jaxface._types import Array, Float
 from jaxface.models.winograd import _INPUT, _KERNEL, _OUTPUT
 
-TILES_AT_ONCE = 256
-"""tiles of one call; keeps what a call transforms within the processor's cache"""
+TILES_AT_ONCE = 48
+"""tiles of one call; keeps what a call transforms within the processor's second-level cache"""
 
 
 @jax.jit
@@ -44,15 +44,6 @@ def convolve_tiles(
     products = lax.dot_general(points, transformed, (((2,), (1,)), ((0,), (0,))))
     result = _both_axes(back, products)
     return jnp.maximum(result.reshape(16, tiles, outputs) + bias, 0)
-
-
-@jax.jit
-def convolve_pixels(
-    patches: Float[Array, "9 p i"], kernel: Float[Array, "9 i o"], bias: Float[Array, "o"]
-) -> Float[Array, "1 p o"]:
-    """The same for single pixels by the direct sum, for layers of very few input channels."""
-    rows = jnp.swapaxes(patches, 0, 1).reshape(patches.shape[1], -1)
-    return jnp.maximum(rows @ kernel.reshape(-1, kernel.shape[2]) + bias, 0)[None]
 
 
 def _both_axes(

@@ -1,8 +1,10 @@
 """Gram matrices of a whole database behind any mask, from what is computed once of each texture."""
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +12,9 @@ import numpy as np
 
 from jaxface._types import Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
+from jaxface.io.atomic import atomic_path
 from jaxface.io.gram_cache import GramCache, digest
-from jaxface.io.texture_database import TextureDatabase
+from jaxface.io.texture_database import Subject, TextureDatabase
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
 from jaxface.stages.masked_grams import (
     Layout,
@@ -24,6 +27,9 @@ from jaxface.stages.masked_grams import (
 
 FOLDER = "grams"
 """folder of the cache in a database's"""
+
+STAMPS = "textures.json"
+"""which file of the cache belongs to which texture file, by size and time of change"""
 
 LARGEST_BYTES = 64 * 1024**3
 """what a cache may hold, unless said otherwise"""
@@ -40,6 +46,16 @@ class PrecomputedGrams:
     """of the textures' files, in the database's order"""
 
 
+def bytes_to_precompute(
+    database: TextureDatabase,
+    network: FeatureNetwork,
+    resolution: int | None = None,
+    layers: Sequence[str] = STYLE_LAYERS,
+) -> int:
+    """Bytes that `precompute` will take on disk; arguments and errors are the same."""
+    return _files(database, network, resolution, layers, None)[1].bytes_per_texture * len(database)
+
+
 def precompute(
     database: TextureDatabase,
     network: FeatureNetwork,
@@ -51,6 +67,9 @@ def precompute(
     maximum_bytes: int = LARGEST_BYTES,
 ) -> PrecomputedGrams:
     """Compute and keep what `masked_grams` needs; textures that lie there whole are not redone.
+
+    Every file is written whole or not at all, so a killed run goes on where it stopped. Files of
+    other networks, resolutions or former textures stay while there is room, the oldest go first.
 
     Args:
         database: the textures.
@@ -64,6 +83,67 @@ def precompute(
     Raises:
         ValueError: the resolution does not divide the database's, or the cache would be too big.
     """
+    plan, files, side, identity = _files(database, network, resolution, layers, folder)
+    size = files.bytes_per_texture * len(database)
+    if size > maximum_bytes:
+        raise ValueError(
+            f"the cache of {len(database)} textures would hold {size} bytes, more than the "
+            f"{maximum_bytes} allowed; a lower resolution needs a quarter for each halving"
+        )
+    stamps = _read_stamps(files.path)
+    known = stamps.setdefault(identity, {})
+    compute = jax.jit(lambda network, image: store(network, image, plan))
+    keys: list[str] = []
+    for index, subject in enumerate(database.subjects):
+        stamp, (before, key) = _stamp(database, subject), known.get(subject.name, ("", ""))
+        if before != stamp or not files.is_whole(key):
+            image = intensity(database.encoded(subject.name), side)
+            key = digest(identity, image)
+            if not files.is_whole(key):
+                files.write(key, compressed(compute(network, jnp.asarray(image)), plan))
+            known[subject.name] = (stamp, key)
+            with atomic_path(files.path / STAMPS) as temporary:
+                temporary.write_text(json.dumps(stamps, indent=1), encoding="utf-8")
+        keys.append(key)
+        on_progress(index + 1, len(database))
+    files.prune(keys, maximum_bytes)
+    return PrecomputedGrams(network, plan, files, tuple(keys))
+
+
+def find_precomputed(
+    database: TextureDatabase,
+    network: FeatureNetwork,
+    resolution: int | None = None,
+    *,
+    layers: Sequence[str] = STYLE_LAYERS,
+    folder: str | os.PathLike[str] | None = None,
+) -> PrecomputedGrams | None:
+    """What `precompute` has kept, if it is there for every texture as it is now; else None.
+
+    No texture is read: files count as unchanged while their size and time of change are the same.
+
+    Raises:
+        ValueError: the resolution does not divide the database's.
+    """
+    plan, files, _, identity = _files(database, network, resolution, layers, folder)
+    known = _read_stamps(files.path).get(identity, {})
+    keys = []
+    for subject in database.subjects:
+        stamp, key = known.get(subject.name, ("", ""))
+        if stamp != _stamp(database, subject) or not files.is_whole(key, thorough=False):
+            return None
+        keys.append(key)
+    return PrecomputedGrams(network, plan, files, tuple(keys))
+
+
+def _files(
+    database: TextureDatabase,
+    network: FeatureNetwork,
+    resolution: int | None,
+    layers: Sequence[str],
+    folder: str | os.PathLike[str] | None,
+) -> tuple[Layout, GramCache, int, str]:
+    """Layout, files, resolution, and digest of all that the files depend on but the texture."""
     side = database.resolution if resolution is None else resolution
     if side < 1 or database.resolution % side:
         raise ValueError(
@@ -71,28 +151,33 @@ def precompute(
         )
     plan = layout(network, (side, side), layers)
     files = GramCache(folder or database.path / FOLDER, plan.shapes, plan.types)
-    size = files.bytes_per_texture * len(database)
-    if size > maximum_bytes:
-        raise ValueError(
-            f"the cache of {len(database)} textures would hold {size} bytes, more than the "
-            f"{maximum_bytes} allowed; a lower resolution needs a quarter for each halving"
-        )
     identity = digest(
         network.pooling,
         repr(plan),
         *(network.kernels[name] for name in network.layers),
         *(network.biases[name] for name in network.layers),
     )
-    compute = jax.jit(lambda network, image: store(network, image, plan))
-    keys = []
-    for index, name in enumerate(database.names):
-        image = intensity(database.encoded(name), side)
-        key = digest(identity, image)
-        if not files.is_whole(key):
-            files.write(key, compressed(compute(network, jnp.asarray(image)), plan))
-        keys.append(key)
-        on_progress(index + 1, len(database))
-    return PrecomputedGrams(network, plan, files, tuple(keys))
+    return plan, files, side, identity
+
+
+def _stamp(database: TextureDatabase, subject: Subject) -> str:
+    try:
+        status = (database.path / subject.file).stat()
+    except OSError:
+        return "absent"
+    return f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _read_stamps(folder: Path) -> dict[str, dict[str, tuple[str, str]]]:
+    """By `identity` and subject: the texture file's stamp and the cache file's key."""
+    try:
+        content = json.loads((folder / STAMPS).read_text(encoding="utf-8"))
+        return {
+            str(identity): {str(name): (str(a), str(b)) for name, (a, b) in entries.items()}
+            for identity, entries in content.items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}  # absent or damaged: found anew from the textures themselves
 
 
 def intensity(encoded: Float[np.ndarray, "r r 3"], side: int) -> Float[np.ndarray, "s s"]:

@@ -1,7 +1,8 @@
 """What is cached of a texture, so that its masked Gram matrices need little of the network.
 
-Of large maps the sums of ``F F^T`` over square cells, in a pyramid; of small ones the responses;
-and the result of every pooling. See `splice` for what they are for and how exact they are.
+The result of every pooling; the responses of the layers from the second block on that the next
+layer of their block, or a Gram matrix, asks for; and of large maps with a Gram matrix the sums
+of ``F F^T`` over square cells, in a pyramid. See `splice` for what they are for.
 """
 
 import math
@@ -29,8 +30,11 @@ Stored = Mapping[str, np.ndarray]
 _LARGEST_CELLS = 8.5
 """numbers in a layer's finest cells, for each pixel of the texture, at most"""
 
+_FINEST = 16
+"""px of a layer's map, side of the finest cells"""
+
 _SMALLEST_CELLED = 192
-"""px; of smaller maps the responses themselves are cached"""
+"""px; smaller maps have no cells"""
 
 
 class Layout(NamedTuple):
@@ -39,7 +43,9 @@ class Layout(NamedTuple):
     shapes: dict[str, tuple[int, ...]]
     types: dict[str, str]
     cells: dict[str, int]
-    """of each layer, side of its cells in pixels of its map; 0: its responses are cached"""
+    """of each layer with a Gram matrix, side of its cells in pixels of its map; 0: none"""
+    cached: dict[str, bool]
+    """of each layer, whether its responses are cached"""
 
     @property
     def bytes(self) -> int:
@@ -62,8 +68,8 @@ def layout(
         network: the extractor.
         shape: height and width of the textures.
         layers: those whose Gram matrices are wanted.
-        cells: by layer, side of its cells (px of its map), 0 to cache responses; by default
-            the smallest power of two, from 8, whose sums are not too many.
+        cells: by layer, side of its cells (px of its map), 0 to cache responses alone; by default
+            the smallest power of two, from 16, whose sums are not too many.
 
     Raises:
         ValueError: a layer is unknown, or its map would be empty.
@@ -74,30 +80,38 @@ def layout(
     shapes: dict[str, tuple[int, ...]] = {"image": shape}
     types = {"image": "<f4"}
     chosen: dict[str, int] = {}
+    cached: dict[str, bool] = {}
     for index, block in enumerate(blocks):
         height, width = shape[0] >> index, shape[1] >> index
         if index:
             channels = network.channels[blocks[index - 1][-1]]
             shapes[f"pool{index}"] = (height * width, channels)
-        for name in (name for name in block if name in layers):
+        for name in block:
             n = network.channels[name]
-            packed = n * (n + 1) // 2
-            cell = 8 if index else 16
-            while -(-height // cell) * -(-width // cell) * packed > _LARGEST_CELLS * math.prod(
-                shape
-            ):
-                cell *= 2
-            cell = cell if min(height, width) >= _SMALLEST_CELLED else 0
-            cell = chosen[name] = cell if cells is None else cells.get(name, cell)
-            if cell:
-                count = sum(math.prod(level) for level in pyramid_shapes((height, width), cell))
-                shapes[f"{name}/cells"] = (count, packed)
-            else:
+            if name in layers:
+                cell = _FINEST if min(height, width) >= _SMALLEST_CELLED else 0
+                while cell and _packed(n) * math.prod(pyramid_shapes((height, width), cell)[0]) > (
+                    _LARGEST_CELLS * math.prod(shape)
+                ):
+                    cell *= 2
+                cell = chosen[name] = cell if cells is None else cells.get(name, cell)
+                if cell:
+                    count = sum(math.prod(level) for level in pyramid_shapes((height, width), cell))
+                    shapes[f"{name}/cells"] = (count, _packed(n))
+            # The first block's are as large as all others together, and cheap.
+            cached[name] = chosen.get(name) == 0 or (
+                index > 0 and (name in layers or name != block[-1])
+            )
+            if cached[name]:
                 shapes[name] = (height * width, n)
     for name in list(shapes)[1:]:
         types[name], types[f"{name}/scale"] = "<f2", "<f4"
         shapes[f"{name}/scale"] = (shapes[name][0] if name.endswith("cells") else 1,)
-    return Layout(shapes, types, {name: chosen[name] for name in layers})
+    return Layout(shapes, types, {name: chosen[name] for name in layers}, cached)
+
+
+def _packed(n: int) -> int:
+    return n * (n + 1) // 2
 
 
 def store(network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout) -> dict[str, Array]:
@@ -116,11 +130,9 @@ def store(network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout) -
             found[f"pool{index}"] = x.reshape(-1, x.shape[-1])
         for name in block:
             x = conv3x3_relu(x, network.kernels[name], network.biases[name])
-            if name not in layout.cells:
-                continue
-            if layout.cells[name]:
+            if layout.cells.get(name):
                 found[f"{name}/cells"] = _cell_sums(x, layout.cells[name])
-            else:
+            if layout.cached[name]:
                 found[name] = x.reshape(-1, x.shape[-1])
     return found
 
