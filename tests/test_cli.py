@@ -35,6 +35,8 @@ def test_help_lists_the_commands():
         ("fit", "demo", "-o", "OUT", "--face", "7"),
         ("landmarks", "demo", "-o", "OUT", "--scheme", "dlib5"),
         ("model", "info", "missing.npz"),
+        ("database", "build", "no_such_folder", "-o", "OUT", "--licence", "CC0-1.0"),
+        ("database", "precompute", "no_such_folder"),
     ],
 )
 def test_mistakes_end_with_code_2_and_one_line(tmp_path, arguments):
@@ -82,6 +84,70 @@ def test_model_info_json():
     facts = json.loads(answer.stdout)
     assert facts["expression_modes"] == 52
     assert facts["landmarks68"] and facts["landmarks468"]
+
+
+def test_a_folder_that_makes_no_database(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "notes.txt").write_text("no photo")
+    build = ("database", "build", photos, "-o", tmp_path / "out", "--licence")
+    answer = run(*build, "CC0-1.0")
+    assert answer.exit_code == 2 and "no photo" in answer.output
+    (photos / "a.jpg").write_bytes(b"broken")
+    for arguments, told in [
+        ((" ",), "licence is empty"),
+        (("CC0-1.0", "--resolution", "5"), "resolution is 5"),
+        (("CC0-1.0", "--resolution", "64"), "a.jpg"),
+    ]:
+        answer = run(*build, *arguments)
+        assert answer.exit_code == 2 and told in answer.output, answer.output
+        assert "Traceback" not in answer.output
+    assert not (tmp_path / "out" / "database.json").exists()
+
+
+def test_precompute_says_its_size_and_goes_on(tmp_path):
+    from jaxface.io.models import load_model
+    from jaxface.io.texture_database import TextureDatabase
+
+    database = TextureDatabase.create(
+        tmp_path, load_model("makehuman"), 64, name="noise", licence="CC0-1.0"
+    )
+    for seed, name in enumerate(("a", "b")):
+        texture = np.random.default_rng(seed).random((64, 64, 3)).astype(np.float32)
+        database.write_subject(name, texture)
+    answer = run("database", "precompute", tmp_path, "--limit", "1e-6")
+    assert answer.exit_code == 2 and "would hold" in answer.output
+    first = run("database", "precompute", tmp_path)
+    assert first.exit_code == 0, first.output
+    assert "GB" in first.output
+    files = sorted((tmp_path / "grams").glob("*.grams"))
+    assert len(files) == 2
+    stamps = [file.stat().st_mtime_ns for file in files]
+    assert run("database", "precompute", tmp_path).exit_code == 0
+    assert [file.stat().st_mtime_ns for file in files] == stamps
+    assert run("database", "precompute", tmp_path, "--resolution", "48").exit_code == 2
+
+
+@pytest.mark.slow
+def test_database_from_photos_goes_on_where_it_stopped(tmp_path):
+    from skimage import data
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.fromarray(data.astronaut()).save(photos / "a.png")
+    (photos / "b.jpg").write_bytes(b"broken")
+    build = ("database", "build", photos, "-o", tmp_path / "db", "--licence", "public domain")
+    build = (*build, "--resolution", "128", "--size", "128")
+    first = run(*build)
+    assert first.exit_code == 2 and "b.jpg" in first.output, first.output
+    texture = tmp_path / "db" / "textures" / "a.png"
+    stamp = texture.stat().st_mtime_ns
+    (photos / "b.jpg").unlink()
+    second = run(*build)
+    assert second.exit_code == 0, second.output
+    assert texture.stat().st_mtime_ns == stamp
+    facts = json.loads(run("database", "info", tmp_path / "db", "--json").stdout)
+    assert facts["subjects"] == 1 and not facts["missing"]
 
 
 @pytest.mark.slow

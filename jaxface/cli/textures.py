@@ -160,6 +160,56 @@ def database_import_scan(
     console.print(f"wrote [bold]{out}[/bold]")
 
 
+@database_app.command("build")
+def database_build(
+    photos: Annotated[Path, typer.Argument(help="Folder with one photo of each subject.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the database.")],
+    licence: Annotated[
+        str, typer.Option("--licence", help="What may be done with these people's textures.")
+    ],
+    resolution: Annotated[int, typer.Option("--resolution", help="Texels along a side.")] = 1024,
+    credit: Annotated[
+        list[str] | None, typer.Option("--credit", help="Line to print with results; repeatable.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Of the database; the folder's if not given.")
+    ] = None,
+    model: Annotated[
+        str, typer.Option("--model", help="In whose UVs the textures will be: name or file.")
+    ] = "makehuman",
+    size: Annotated[int, typer.Option("--size", help="Side of the fits' working image, px.")] = 512,
+    common_light: Annotated[
+        bool, typer.Option(help="Take the photos to be under one light, or each under its own.")
+    ] = True,
+    specularity: Annotated[
+        bool, typer.Option("--remove-specularity/--keep-specularity", help="Gloss of the skin.")
+    ] = True,
+) -> None:
+    """Albedo textures from a folder of photos; goes on where an earlier run stopped."""
+    from jaxface.pipeline.photo_database import build_database
+
+    told: dict[str, str] = {}
+    lost: set[str] = set()
+    with errors(), steps(str(photos)) as on_step:
+
+        def show(step: Any) -> None:
+            on_step({"fit": "fits", "texture": "textures"}[step.stage], step.done, step.total)
+            if step.problem is not None:
+                told[step.photo.name] = step.problem
+                if step.stage == "fit":
+                    lost.add(step.photo.name)
+
+        made = build_database(
+            photos, out, resolution, licence=licence, credits=credit or (), name=name, model=model,
+            size=size, common_light=common_light, remove_specularity=specularity, on_progress=show,
+        )  # fmt: skip
+    for problem in told.values():
+        console.print(f"[yellow]{problem}[/yellow]", highlight=False, soft_wrap=True)
+    console.print(f"{len(made)} textures in [bold]{out}[/bold]")
+    if lost:
+        raise typer.Exit(2)
+
+
 @database_app.command("precompute")
 def database_precompute(
     path: Annotated[Path, typer.Argument(help="Folder of a database.")],

@@ -194,6 +194,14 @@ def masked_grams(
 ) -> dict[str, Float[np.ndarray, "k n n"]]:
     """Gram matrices ``G^l(M(I_k))`` of all textures behind one mask, by layer.
 
+    They are what `stages.blend.blend` takes as its columns. A target to compare with them must be
+    of the whole map too, not of a cut of it, whose border the network would see::
+
+        cache = find_precomputed(database, network, side, layers=layers)
+        columns = masked_grams(cache, mask)
+        target = grams(network, mask_out(photo_intensity, mask), layers)
+        blended = blend(columns, target)
+
     Args:
         cache: by `precompute`.
         mask: true where visible, row 0 at the top, at the cache's resolution.

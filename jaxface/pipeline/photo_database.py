@@ -74,7 +74,8 @@ def build_database(
     Raises:
         FileNotFoundError: there is no such folder.
         ValueError: the folder holds no photo, or none with a face; two photos have one name; the
-            licence is empty; or another database lies in ``out``.
+            licence is empty; the resolution is not 16 to 16384; or another database lies in
+            ``out``.
     """
     tell = on_progress or (lambda step: None)
     folder = Path(photos_dir)
@@ -82,6 +83,8 @@ def build_database(
         raise FileNotFoundError(f"there is no folder of photos {folder}")
     if not licence.strip():
         raise ValueError("licence is empty; say what may be done with the textures of the photos")
+    if not 16 <= resolution <= 16384:
+        raise ValueError(f"resolution is {resolution}; it needs 16 to 16384 texels")
     photos = photos_in(folder)
     names = [subject_name(photo) for photo in photos]
     twice = sorted({n for n in names if names.count(n) > 1})

@@ -8,15 +8,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from jaxface._types import Array, Float
 from jaxface.imaging.colour import srgb_to_linear
+from jaxface.imaging.masks import fill_polygon
 from jaxface.imaging.suv import remove_specular_peak
 from jaxface.io.fit_file import SavedFit, read_fit, write_fit
+from jaxface.io.gram_cache import digest
+from jaxface.models.landmark_schemes import LIPS_OUTER
 from jaxface.models.morphable import MorphableModel
 from jaxface.pipeline.clock import Clock
 from jaxface.pipeline.fitting import FittedFace, as_photo, fit
 from jaxface.stages.fit import FitModel, working_photo
+
+LIP_MARGIN = 0.008
+"""of the working image's side, by which lips are taken to be wider than their outline"""
 
 
 class BuildStep(NamedTuple):
@@ -55,8 +62,13 @@ def fit_photos(
         problem = None
         file = folder / f"{subject}.npz"
         try:
-            if not _is_current(file, photo, model):
-                _write_photo_fit(file, fit(photo, model, **options), photo)
+            origin = {
+                "model": model.name,
+                "digest": digest(photo.read_bytes()),
+                "options": repr(sorted(options.items())),
+            }
+            if not _is_current(file, origin):
+                _write_photo_fit(file, fit(photo, model, **options), photo, origin)
             fits[subject] = read_fit(file)
         except (ValueError, OSError) as error:
             problem = f"{photo.name} is left out: {error}"
@@ -65,27 +77,22 @@ def fit_photos(
     return fits, first_problem
 
 
-def _is_current(file: Path, photo: Path, model: MorphableModel) -> bool:
-    """Whether the fit of this very photo with this model lies there, whole."""
+def _is_current(file: Path, origin: dict[str, str]) -> bool:
+    """Whether the fit of this very photo, with this model and options, lies there, whole."""
     try:
         known = read_fit(file).metadata
     except (FileNotFoundError, ValueError):
         return False
-    return known.get("model") == model.name and known.get("bytes") == photo.stat().st_size
+    return all(known.get(key) == value for key, value in origin.items())
 
 
-def _write_photo_fit(file: Path, fitted: FittedFace, photo: Path) -> None:
+def _write_photo_fit(file: Path, fitted: FittedFace, photo: Path, origin: dict[str, str]) -> None:
     skin = np.round(255 * np.asarray(fitted.skin_map())).astype(np.uint8)
     write_fit(
         file,
         fitted.parameters,
         {"landmarks": fitted.landmarks.astype(np.float32), "skin": skin},
-        {
-            "model": fitted.model.name,
-            "photo": photo.name,
-            "bytes": photo.stat().st_size,
-            "landmark_error": fitted.landmark_error(),
-        },
+        {**origin, "photo": photo.name, "landmark_error": fitted.landmark_error()},
     )
 
 
@@ -113,7 +120,8 @@ class FittedPhoto:
         size = len(self.skin)
         working = working_photo(linear, self.landmarks, size=size)
         if self.diffuse:
-            linear = _without_specularity(linear, working.crop, self.skin, self.parameters.light)
+            mask = self.skin * (1 - _lips(size * working.crop.to_crop(self.landmarks), size))
+            linear = _without_specularity(linear, working.crop, mask, self.parameters.light)
             gain = working.gain
             again = working_photo(linear, self.landmarks, size=size)
             data = eqx.tree_at(
@@ -133,6 +141,18 @@ class FittedPhoto:
             linear, working._replace(data=data), self.landmarks, models, parameters, none, none,
             Clock(),
         )  # fmt: skip
+
+
+def _lips(points: Float[np.ndarray, "l 2"], size: int) -> Float[np.ndarray, "s s"]:
+    """Where the lips are, 0 to 1.
+
+    They are redder than any skin beside them: what little they have of the source's colour would
+    be taken for gloss, and they for darker than they are.
+    """
+    outline = points[list(LIPS_OUTER)] if len(points) == 468 else points[48:60]
+    inside = np.asarray(fill_polygon(jnp.asarray(outline, jnp.float32), size, size), np.float32)
+    grown = maximum_filter(inside, size=2 * round(LIP_MARGIN * size) + 1)
+    return gaussian_filter(grown, LIP_MARGIN * size)
 
 
 def _without_specularity(
