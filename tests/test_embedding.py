@@ -26,6 +26,22 @@ def test_finds_the_bundled_landmarks_again():
 
 
 @pytest.mark.slow
+def test_points_on_openings_stay_on_the_outside():
+    # Without eyeballs and inner mouth a pixel in an opening shows the inside of the head.
+    model = load_bundled("makehuman")
+    hollow = model.region_mask("eyes", "mouth_interior")[model.faces].any(axis=1)
+    kept = np.flatnonzero(~np.asarray(hollow))
+    change = (model.faces[kept], model.uv_faces[kept], None, None)
+    open_eyed = eqx.tree_at(lambda m: (m.faces, m.uv_faces, m.quads, m.uv_quads), model, change)
+    found = embed_landmarks(open_eyed, yaws=(-15.0, 0.0, 15.0))
+    assert model.landmarks468 is not None
+    distance = np.linalg.norm(
+        np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1
+    )
+    assert np.percentile(distance, 97) < 12.0 and distance.max() < 40.0
+
+
+@pytest.mark.slow
 def test_a_model_seen_from_behind_is_refused():
     model = load_bundled("makehuman")
     turned = model.mean * np.array([-1.0, 1.0, -1.0], np.float32)

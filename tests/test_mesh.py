@@ -109,3 +109,15 @@ def test_neighbours_and_incident_triangles():
     empty = np.zeros((0, 3), int)
     assert mesh.edges(empty).shape == (0, 2)
     assert mesh.incident_faces(empty, 3).shape == (3, 0)
+
+
+def test_smoothing_keeps_a_constant_and_evens_out_the_rest(x64):
+    faces = jnp.asarray(grid(9)[1])
+    rough = jnp.asarray(np.random.default_rng(0).normal(size=(82, 2)))
+    constant = jnp.ones((82, 2))
+    np.testing.assert_allclose(mesh.smooth_over_mesh(constant, faces, 3)[:81], 1.0)
+    once, often = (mesh.smooth_over_mesh(rough, faces, n)[:81] for n in (1, 8))
+    assert jnp.std(often) < 0.6 * jnp.std(once) < 0.6 * jnp.std(rough)
+    # A vertex of no triangle has no neighbours to learn from.
+    np.testing.assert_array_equal(mesh.smooth_over_mesh(rough, faces, 1)[81], 0.0)
+    np.testing.assert_array_equal(mesh.smooth_over_mesh(rough, faces, 0), rough)

@@ -132,3 +132,29 @@ def _padded_table(keys: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray
     table = np.full((rows, int(counts.max(initial=0))), -1, np.int32)
     table[keys, np.arange(len(keys)) - starts[keys]] = values
     return table
+
+
+def smooth_over_mesh(
+    values: Float[Array, "n c"], faces: Int[Array, "f 3"], rounds: int
+) -> Float[Array, "n c"]:
+    """Per-vertex values averaged over their triangles, again and again.
+
+    A round replaces each value by the mean over the vertex's triangles of the triangle's mean, the
+    random walk of a lazy Laplacian; its standard deviation grows with the root of the rounds, by
+    about 0.7 edge lengths in the first. A vertex without triangles becomes zero.
+
+    Args:
+        values: c numbers a vertex.
+        faces: triangles.
+        rounds: number of averages.
+    """
+    degree = jnp.zeros((values.shape[0], 1), values.dtype).at[faces.reshape(-1)].add(1.0)
+
+    def average(x: Array, _: None) -> tuple[Array, None]:
+        mean = (x[faces[:, 0]] + x[faces[:, 1]] + x[faces[:, 2]]) / 3
+        total = jnp.zeros_like(x)
+        for corner in range(3):
+            total = total.at[faces[:, corner]].add(mean)
+        return total / jnp.maximum(degree, 1.0), None
+
+    return jax.lax.scan(average, values, None, length=rounds)[0]

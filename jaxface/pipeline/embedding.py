@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from jaxface._types import Bool, Float, Int
 from jaxface.geometry.camera import Camera, Pose
@@ -31,6 +32,12 @@ _FOCAL = 1500.0
 YAWS = (-30.0, -15.0, 0.0, 15.0, 30.0)
 """degrees; the model's mean is looked at from these sides"""
 
+STEEPEST = 70.0
+"""degrees between normal and view up to which a pixel tells where a point is"""
+
+REACH = 10.0
+"""px to the nearest such pixel up to which it does"""
+
 
 class Embedding(NamedTuple):
     """Correspondences and how well the views agree on them.
@@ -52,10 +59,10 @@ def embed_landmarks(model: MorphableModel, yaws: Sequence[float] = YAWS) -> Embe
     """Find the 468 points of the face mesh on a model's mean face.
 
     The mean is rendered from several sides under a soft light from the front, the detector runs
-    on each picture, and the pixels it names are carried back through the rasteriser's triangle
-    ids and barycentrics. Views are averaged where they agree (a robust mean: the median over
-    views that see the point from less than 70 degrees), and the average is dropped on the mesh
-    at the nearest surface point among those the views hit.
+    on each picture, and the pixels it names (or the nearest that show the outside of the surface
+    from less than 70 degrees, within 10 px) are carried back through the rasteriser's triangle
+    ids and barycentrics. The median over the views is dropped on the mesh at the nearest
+    surface point.
 
     Raises:
         ValueError: the detector finds a face in fewer than two views.
@@ -85,10 +92,9 @@ def embed_landmarks(model: MorphableModel, yaws: Sequence[float] = YAWS) -> Embe
             continue
         points = np.asarray(found[0].landmarks)[:, :2]
         pictures.append(draw_landmarks(picture, points))
-        hit, valid = _surface_hits(points, image.fragments, np.asarray(model.mean), faces)
-        facing = _facing(image, points)
+        hit, valid = _surface_hits(points, image, np.asarray(model.mean), faces)
         hits.append(hit)
-        seen.append(valid & (facing > np.cos(np.radians(70))))
+        seen.append(valid)
     if len(hits) < 2:
         raise ValueError(
             f"the detector finds a face in {len(hits)} of {len(yaws)} views of the model "
@@ -141,33 +147,22 @@ def _face_centre(model: MorphableModel) -> Float[np.ndarray, "3"]:
 
 
 def _surface_hits(
-    points: np.ndarray, fragments: Any, vertices: np.ndarray, faces: Int[np.ndarray, "f 3"]
+    points: np.ndarray, image: Any, vertices: np.ndarray, faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "l 3"], Bool[np.ndarray, "l"]]:
-    """Model-frame surface point under each image point, from the nearest covered pixel."""
-    triangle = np.asarray(fragments.triangle)
-    weights = np.asarray(fragments.barycentric)
-    corners = vertices[faces[np.maximum(triangle, 0)]]
-    surface = np.einsum("hwi,hwij->hwj", weights, corners)
-    x = np.clip(points - 0.5, 0, np.array(triangle.shape[::-1]) - 1.001)
-    low = np.floor(x).astype(int)
-    share = x - low
-    total, hit = np.zeros(len(points)), np.zeros((len(points), 3))
-    for dy in (0, 1):
-        for dx in (0, 1):
-            at = (low[:, 1] + dy, low[:, 0] + dx)
-            w = np.abs(1 - dx - share[:, 0]) * np.abs(1 - dy - share[:, 1])
-            w = w * (triangle[at] >= 0)
-            total += w
-            hit += w[:, None] * surface[at]
-    valid = total > 0.5
-    return hit / np.maximum(total, 1e-9)[:, None], valid
+    """Model-frame surface point under each image point, and whether it is to be trusted.
 
-
-def _facing(image: Any, points: np.ndarray) -> Float[np.ndarray, "l"]:
-    """Cosine between the normal and the view axis at the pixel of each point."""
-    normal = np.asarray(image.normals)
-    at = np.clip(points.astype(int), 0, normal.shape[0] - 1)
-    return normal[at[:, 1], at[:, 0], 2]
+    Taken from the nearest pixel that shows the outside of the surface: through the openings of eyes
+    and mouth, where a model has no eyeballs and no teeth, a pixel shows the inside of the head.
+    """
+    triangle = np.asarray(image.fragments.triangle)
+    outside = (triangle >= 0) & (np.asarray(image.normals)[..., 2] > np.cos(np.radians(STEEPEST)))
+    away, (rows, columns) = distance_transform_edt(~outside, return_indices=True)
+    column, row = np.clip(points.astype(int), 0, np.array(triangle.shape[::-1]) - 1).T
+    far = away[row, column]
+    row, column = rows[row, column], columns[row, column]
+    corners = vertices[faces[triangle[row, column]]]
+    weights = np.asarray(image.fragments.barycentric)[row, column]
+    return np.einsum("li,lij->lj", weights, corners), far <= REACH
 
 
 def _nearest_points(model: MorphableModel, places: Float[np.ndarray, "l 3"]) -> SurfacePoints:

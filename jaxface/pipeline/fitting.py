@@ -19,24 +19,19 @@ from jaxface.io.image import Photo, read_image
 from jaxface.io.models import load_model
 from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel
-from jaxface.models.parameters import FaceParameters, neutral_parameters
+from jaxface.models.parameters import FaceParameters
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.clock import Clock, KeptProgram, quick_compilation
-from jaxface.pipeline.programs import keep_structure
+from jaxface.pipeline.clock import Clock
+from jaxface.pipeline.fit_levels import fit_levels
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
-    FitInput,
     FitModel,
     FitRender,
     FitStats,
     FitWeights,
-    LevelRecord,
     Posterior,
     WorkingPhoto,
-    fit_level,
-    fit_start,
-    join_records,
     posterior,
     prepare,
     render_fit,
@@ -122,40 +117,6 @@ class FittedFace:
         points = jnp.asarray(data.landmarks * self.size)
         brows = _brow_program(self.size)(points) * data.mask * rendered.skin
         return np.maximum(np.asarray(shown), np.asarray(brows))
-
-
-@functools.cache
-def _start_program() -> KeptProgram:
-    return KeptProgram("fit_start", fit_start, quick_compilation())
-
-
-@functools.cache
-def _level_program(level: int) -> KeptProgram:
-    function = functools.partial(fit_level, level=level)
-    return KeptProgram(f"fit_level_{level}", function, quick_compilation())
-
-
-def _fit_levels(
-    clock: Clock,
-    data: FitInput,
-    models: tuple[FitModel, ...],
-    weights: FitWeights,
-    config: FitConfig,
-) -> tuple[FaceParameters, FitStats]:
-    """``fit_parameters``, a program a level, so that they compile side by side."""
-    programs = [_level_program(level) for level in range(len(models))]
-    y = jax.eval_shape(neutral_parameters, models[0].model)
-    keep_structure(y)
-    keep_structure(LevelRecord({}, y.log_focal, y.identity))
-    calls = [(_start_program(), (data, models[0], weights, config))]
-    calls += [(p, (y, data, m, weights, config)) for p, m in zip(programs, models, strict=True)]
-    clock.prepare("fit", calls)
-    y, record = clock.run("fit", _start_program(), data, models[0], weights, config)
-    records = [record]
-    for program, model in zip(programs, models, strict=True):
-        y, record = clock.run("fit", program, y, data, model, weights, config)
-        records.append(record)
-    return y, join_records(records)
 
 
 @functools.cache
@@ -274,6 +235,7 @@ def fit(
     details: Sequence[int] | None = None,
     extra_terms: Sequence[Term] = (),
     self_shadow: bool = True,
+    shadow_directions: int = 256,
     clock: Clock | None = None,
 ) -> FittedFace:
     """Fit a morphable model to a photo (Saito 2017, section 3).
@@ -292,6 +254,8 @@ def fit(
         extra_terms: your own terms, functions of ``(FaceParameters, FitData)``.
         self_shadow: whether the shading lacks what the face hides from itself of the light
             (``render.occlusion``, of the mean face); the paper's does not.
+        shadow_directions: directions of light whose hard shadows on the face are followed
+            (`cast_shadows`); 0, or no ``self_shadow``: soft ones only.
         clock: where times are noted.
 
     Raises:
@@ -324,8 +288,10 @@ def fit(
         "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
     )
     weights = weights or FitWeights()
-    config = FitConfig(steps=tuple(steps), extra_terms=tuple(extra_terms))
-    parameters, stats = _fit_levels(clock, working.data, models, weights, config)
+    config = FitConfig(
+        steps=tuple(steps), extra_terms=tuple(extra_terms), shadow_directions=shadow_directions
+    )
+    parameters, stats, models = fit_levels(clock, working.data, models, weights, config)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
     spread = clock.run(

@@ -6,13 +6,15 @@ section 4): the shading at a point is linear in the light also where eye sockets
 hide a part of it. The hidden part of each spherical harmonic is stored beside ``H(n)``.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Float, Int
+from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.render.rasterize import rasterize
@@ -53,18 +55,71 @@ def self_occlusion(
     """
     vertices = jax.lax.stop_gradient(vertices)
     normals = vertex_normals(vertices, faces)
+    hidden = _hidden_from(vertices, normals, vertices, faces, size, offset)
+
+    def add(total: Array, view: tuple[Array, Array]) -> tuple[Array, None]:
+        direction, _ = view
+        taken = jnp.where(hidden(*view), jnp.maximum(normals @ direction, 0.0), 0.0)
+        return total + taken[:, None] * sh_basis(direction), None
+
+    start = jnp.zeros((len(vertices), 9), vertices.dtype)
+    total, _ = jax.lax.scan(add, start, _views(directions, vertices.dtype))
+    return -total * (4.0 / directions) / jnp.asarray(_LOBE, vertices.dtype)
+
+
+def hidden_directions(
+    points: Float[Array, "p 3"],
+    normals: Float[Array, "p 3"],
+    vertices: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    *,
+    directions: int = 512,
+    size: int = 128,
+    offset: float = 2.0,
+) -> Bool[Array, "p m"]:
+    """Whether a mesh hides each direction of the lattice from points on or near its surface.
+
+    Directions behind a point's own tangent plane are not asked for: what is said of them means
+    nothing. No gradient passes.
+
+    Args:
+        points: mm, in the frame of the directions.
+        normals: unit normals there.
+        vertices: of the mesh that hides; it may be coarser than the surface that is asked for.
+        faces: triangles, counter-clockwise seen from outside; both sides hide.
+        directions: number m of the ``sphere_lattice``.
+        size: depth map's side, px; it spans the mesh.
+        offset: mm along the normal from which a point looks, so that its own surface does not
+            hide it.
+    """
+    points, normals, vertices = jax.lax.stop_gradient((points, normals, vertices))
+    hidden = _hidden_from(points, normals, vertices, faces, size, offset)
+    return jax.lax.map(lambda view: hidden(*view), _views(directions, vertices.dtype)).T
+
+
+def _views(directions: int, dtype: Any) -> tuple[Array, Array]:
+    lattice = sphere_lattice(directions)
+    return jnp.asarray(lattice, dtype), jnp.asarray(_frames(lattice), dtype)
+
+
+def _hidden_from(
+    points: Float[Array, "p 3"],
+    normals: Float[Array, "p 3"],
+    vertices: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    size: int,
+    offset: float,
+) -> Callable[[Array, Array], Array]:
+    """A function of (direction, frame) that tells which points lie in shadow."""
     centre = 0.5 * (jnp.max(vertices, axis=0) + jnp.min(vertices, axis=0))
     radius = jnp.max(jnp.linalg.norm(vertices - centre, axis=1)) + 2 * offset
     # A camera so far away that its rays are parallel to a part of a pixel.
     distance = 40.0 * radius
     camera = Camera(0.5 * size * distance / radius, jnp.full(2, 0.5 * size, vertices.dtype))
-    looking = vertices + offset * normals - centre
-    towards = jnp.asarray(sphere_lattice(directions), vertices.dtype)
-    frames = jnp.asarray(_frames(sphere_lattice(directions)), vertices.dtype)
+    looking = points + offset * normals - centre
     away = jnp.array([0.0, 0.0, 1.0], vertices.dtype) * distance
 
-    def add(total: Array, view: tuple[Array, Array]) -> tuple[Array, None]:
-        direction, frame = view
+    def hidden(direction: Array, frame: Array) -> Array:
         depth = rasterize(
             camera.project((vertices - centre) @ frame.T - away), faces, size, size
         ).depth
@@ -76,11 +131,9 @@ def self_occlusion(
         # A slope within a pixel of the depth map must not hide the point on it.
         pixel = 2 * radius / size
         slope = jnp.sqrt(jnp.maximum(1 - facing**2, 0.0)) / jnp.maximum(facing, 0.2)
-        hidden = depth[row, column] < screen[:, 2] - 0.7 * pixel * slope
-        return total + jnp.where(hidden, facing, 0.0)[:, None] * sh_basis(direction), None
+        return depth[row, column] < screen[:, 2] - 0.7 * pixel * slope
 
-    total, _ = jax.lax.scan(add, jnp.zeros((len(vertices), 9), vertices.dtype), (towards, frames))
-    return -total * (4.0 / directions) / jnp.asarray(_LOBE, vertices.dtype)
+    return hidden
 
 
 def sh_rotation(rotation: Float[Array, "3 3"]) -> Float[Array, "9 9"]:

@@ -1,6 +1,7 @@
 """Photo -> fitted face (Saito 2017, section 3)."""
 
 from jaxface.stages.fit.batch import fit_batch
+from jaxface.stages.fit.cast_shadows import cast_shadows
 from jaxface.stages.fit.photo import WorkingPhoto, working_photo
 from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
@@ -14,7 +15,14 @@ from jaxface.stages.fit.records import (
     join_records,
 )
 from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
-from jaxface.stages.fit.solve import fit_energy, fit_level, fit_parameters, fit_start
+from jaxface.stages.fit.solve import (
+    fit_energy,
+    fit_level,
+    fit_parameters,
+    fit_shadows,
+    fit_start,
+    follows_shadows,
+)
 
 __all__ = [
     "FitConfig",
@@ -27,12 +35,15 @@ __all__ = [
     "LevelRecord",
     "Posterior",
     "WorkingPhoto",
+    "cast_shadows",
     "fit_batch",
     "fit_energy",
     "fit_hidden_shading",
     "fit_level",
     "fit_parameters",
+    "fit_shadows",
     "fit_start",
+    "follows_shadows",
     "join_records",
     "posterior",
     "prepare",

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Bool, Int
+from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.mesh import boundary_vertices
 from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
 from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
@@ -32,6 +32,12 @@ class FitModel(eqx.Module):
     """vertices of the skin that the photo term compares"""
     face_mask: Bool[Array, "f"]
     """triangles that the photo term compares"""
+
+    def with_occlusion(self, occlusion: Float[Array, "n 9"]) -> "FitModel":
+        """The same with another transfer of self-occlusion."""
+        return eqx.tree_at(
+            lambda m: m.model.occlusion, self, occlusion, is_leaf=lambda x: x is None
+        )
 
 
 def prepare(model: MorphableModel, landmark_count: int) -> FitModel:

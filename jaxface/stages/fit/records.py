@@ -38,6 +38,8 @@ class FitConfig(eqx.Module):
     """steps on landmarks and prior alone, before the first level"""
     curvature_pixels: int = eqx.field(static=True, default=6000)
     """pixels (evenly spread) on which the Jacobian is formed; the gradient uses all"""
+    shadow_directions: int = eqx.field(static=True, default=256)
+    """directions of light whose hard shadows are followed (``cast_shadows``); 0: soft ones only"""
     rtol: float = eqx.field(static=True, default=1e-5)
     extra_terms: tuple[Term, ...] = eqx.field(static=True, default=())
     """your own terms, functions of ``(FaceParameters, FitData)``"""
@@ -88,6 +90,8 @@ class FitStats(eqx.Module):
     """steps used on each level"""
     curvature: Float[Array, "p p"]
     """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
+    occlusion: Float[Array, "n 9"] | None = None
+    """transfer of self-occlusion that the finest level was fitted with"""
 
 
 class LevelRecord(eqx.Module):
@@ -98,10 +102,13 @@ class LevelRecord(eqx.Module):
     curvature: Float[Array, "p p"]
 
 
-def join_records(records: Sequence[LevelRecord]) -> FitStats:
+def join_records(
+    records: Sequence[LevelRecord], occlusion: Float[Array, "n 9"] | None = None
+) -> FitStats:
     """The history of a fit from those of its levels, the landmark-only start first."""
     return FitStats(
         tuple(r.energies for r in records),
         tuple(r.steps for r in records),
         records[-1].curvature,
+        occlusion,
     )

@@ -38,10 +38,10 @@ from jaxface.imaging.pyramid import pyramid
 from jaxface.imaging.resample import bilinear
 from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.render.occlusion import sh_rotation
-from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import sh_basis
 from jaxface.solvers.gauss_newton import Problem, gauss_newton
 from jaxface.solvers.solution import Solution
+from jaxface.stages.fit.cast_shadows import cast_shadows, shadow_trust
 from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import (
@@ -53,6 +53,7 @@ from jaxface.stages.fit.records import (
     LevelRecord,
     join_records,
 )
+from jaxface.stages.fit.visible import visible_triangles
 
 
 def fit_energy(weights: FitWeights | None = None, extra_terms: Sequence[Term] = ()) -> Energy:
@@ -119,9 +120,12 @@ def fit_parameters(
     y, first = fit_start(data, models[0], weights, config)
     records = [first]
     for level, model in enumerate(models):
+        if follows_shadows(model, config, level):
+            y, occlusion = fit_shadows(y, data, model, models[0], config, level)
+            model = model.with_occlusion(occlusion)
         y, record = fit_level(y, data, model, weights, config, level)
         records.append(record)
-    return y, join_records(records)
+    return y, join_records(records, model.model.occlusion)
 
 
 def fit_start(
@@ -131,6 +135,29 @@ def fit_start(
     y, record = fit_landmarks(data, model, weights, config)
     image, mask = _level_image(data, len(config.steps), 0)
     return initial_light(y, image, mask, data, model), record
+
+
+def follows_shadows(model: FitModel, config: FitConfig, level: int) -> bool:
+    """Whether hard shadows are looked for before a level.
+
+    Not before the first, where the shape is still that of the landmarks alone.
+    """
+    return level > 0 and config.shadow_directions > 0 and model.model.occlusion is not None
+
+
+def fit_shadows(
+    y: FaceParameters,
+    data: FitInput,
+    model: FitModel,
+    coarsest: FitModel,
+    config: FitConfig,
+    level: int,
+) -> tuple[FaceParameters, Float[Array, "n 9"]]:
+    """Light, and the transfer of its cast shadows, from the fit of the level before."""
+    image, mask = _level_image(data, len(config.steps), level)
+    return cast_shadows(
+        y, image, mask, data, model, coarsest.model, directions=config.shadow_directions
+    )
 
 
 def fit_level(
@@ -188,6 +215,8 @@ def observe(
     samples = sample_pixels(
         image, mask, triangle, faces, model.face_mask, data.principal, size * size // 2
     )
+    trusted = shadow_trust(y, model.model, samples)
+    samples = eqx.tree_at(lambda s: s.weight, samples, samples.weight * trusted)
     synth = synthesize(y, model.model, samples)
     inlier = inlier_weights(samples.color, synth, samples.weight)
     inlier = jnp.where(data.estimate_inliers, inlier, 1.0)
@@ -209,16 +238,6 @@ def observe(
         focal_prior=(data.log_focal, data.log_focal_deviation),
         weights=weights,
     )
-
-
-def visible_triangles(
-    y: FaceParameters, model: FitModel, principal: Float[Array, "2"], size: int
-) -> Array:
-    """(s, s) index of the triangle each pixel shows, -1 for none; no gradient passes."""
-    y = jax.lax.stop_gradient(y)
-    vertices = y.pose(model.model.shape(y.identity, y.expression))
-    screen = y.camera(principal, size).project(vertices)
-    return rasterize(screen, model.model.faces, size, size, cull=True).triangle
 
 
 def landmark_data(data: FitInput, model: FitModel) -> LandmarkData:
