@@ -9,7 +9,7 @@ nearest to another. Every answer carries a certified lower bound of the minimum.
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,51 +17,18 @@ import optimistix as optx
 from jax.core import Tracer
 
 from jaxface._types import Array, Float
-from jaxface.solvers.simplex_certificate import residuals
+from jaxface.solvers.simplex_answer import ZERO, Answer, Norm, rounded
 from jaxface.solvers.simplex_implicit import with_derivative
+from jaxface.solvers.simplex_many import better, pays, solve_many
 from jaxface.solvers.simplex_projected_gradient import projected_gradient
-from jaxface.solvers.simplex_working_set import Found, working_set
+from jaxface.solvers.simplex_working_set import working_set
 from jaxface.solvers.solution import Solution
 
-Norm = Literal["frobenius", "squared"]
 Method = Literal["working_set", "interior_point", "projected_gradient"]
 
 TOLERANCE = 1e-11
 """default relative gap; double precision inside reaches it at residuals down to about 1e-4 of the
 points' distances"""
-ZERO = 1e-12
-"""an objective below this share of the points' greatest distance counts as zero"""
-
-
-class Answer(NamedTuple):
-    """Numbers of a solve on the simplex, in the precision of its data.
-
-    Attributes:
-        weights: on the simplex; the certificate is of these, after rounding.
-        objective: value at the weights.
-        lower_bound: certified; the minimum is not below it.
-        gap: ``objective - lower_bound``, from double precision.
-        relative_gap: the gap as a share of the objective; 0 where that is zero.
-        scale: the points' greatest distance from the target (squared for squared norms):
-            the gap as a share of this is meaningful where the objective vanishes.
-        norms: ``||r_l||`` of the terms, not squared.
-        dual: the vectors ``y_l`` of the bound.
-        rounds: exchanges of the working set.
-        steps: steps of the method, in all.
-        converged: within the tolerance before rounding to single precision.
-    """
-
-    weights: Float[Array, " k"]
-    objective: Float[Array, ""]
-    lower_bound: Float[Array, ""]
-    gap: Float[Array, ""]
-    relative_gap: Float[Array, ""]
-    scale: Float[Array, ""]
-    norms: Float[Array, " l"]
-    dual: Float[Array, "l m"]
-    rounds: Array
-    steps: Array
-    converged: Array
 
 
 def minimise_on_simplex(
@@ -84,8 +51,8 @@ def minimise_on_simplex(
 
     Differentiable with respect to points and target in ``value`` and ``stats["objective"]``, by
     the implicit function theorem (see ``simplex_implicit``). jit-able; under ``vmap`` the
-    problems are solved one after another, so that an easy one does not wait for a hard one,
-    and points that are not mapped over are not copied.
+    problems are solved one after another, so that an easy one does not wait for a hard one;
+    many targets over points that are not mapped over share what they can (`simplex_many`).
 
     Methods: ``working_set`` (column generation over an interior point method; the default),
     ``interior_point`` (over all points at once), ``projected_gradient`` (jaxopt; inexact).
@@ -169,12 +136,47 @@ def _run(
     else:
         squared = norm == "squared"
         found = projected_gradient(points, weights, tolerance, floor, squared=squared)
-    return _rounded(points, scale, target, found, tolerance, norm=norm, dtype=dtype)
+    return rounded(points, scale, target, found, tolerance, norm=norm, dtype=dtype)
 
 
 @lru_cache
 def _sequential(norm: Norm, method: Method, dtype: str) -> Callable[..., Answer]:
-    return jax.custom_batching.sequential_vmap(partial(_run, norm, method, dtype))
+    """`_run` that maps: many targets share their points' products, other problems take turns."""
+    run = jax.custom_batching.custom_vmap(partial(_run, norm, method, dtype))
+
+    @run.def_vmap
+    def rule(size: int, mapped: Any, points: Any, target: Any, start: Any, tolerance: Any) -> Any:
+        data, axes = (points, target, start, tolerance), tuple(mapped)
+        with jax.enable_x64(True):
+            if (
+                axes[:2] == (False, True)
+                and not axes[3]
+                and method == "working_set"
+                and pays(size, len(points))
+            ):
+                starts = start if axes[2] else jnp.broadcast_to(start, (size, *start.shape))
+                answer = solve_many(norm, dtype, points, target, starts, tolerance)
+
+                def left_over(data: tuple[Answer, Array]) -> Answer:
+                    found, goal = data
+                    return jax.lax.cond(
+                        found.converged,
+                        lambda: found,
+                        lambda: better(found, run(points, goal, _double(found.weights), tolerance)),
+                    )
+
+                answer = jax.lax.map(left_over, (answer, target))
+            else:
+
+                def one(own: list[Array]) -> Answer:
+                    rest = iter(own)
+                    return run(*(next(rest) if m else x for x, m in zip(data, axes, strict=True)))
+
+                turns = [x for x, m in zip(data, axes, strict=True) if m]
+                answer = jax.lax.map(one, turns)
+        return answer, jax.tree.map(lambda _: True, answer)
+
+    return run
 
 
 @partial(jax.jit, static_argnames="norm")
@@ -186,62 +188,6 @@ def _scaled(points: Array, target: Array, *, norm: Norm) -> tuple[Array, Array]:
     lengths = jnp.sum(jnp.linalg.norm(points, axis=-1), axis=-1)
     scale = jnp.max(lengths)
     return points / jnp.where(scale > 0, scale, 1.0), scale
-
-
-@partial(jax.jit, static_argnames=("norm", "dtype"))
-def _rounded(
-    points: Array,
-    scale: Array,
-    target: Array,
-    found: Found,
-    tolerance: Array,
-    *,
-    norm: Norm,
-    dtype: str,
-) -> Answer:
-    """The certificate of the weights as they are after rounding to ``dtype``."""
-    single = dtype != "float64"
-    weights = _sparse(points, found, tolerance)
-    if single:
-        weights = jax.lax.reduce_precision(weights, 8, 23)
-    r = residuals(points, weights / jnp.sum(weights))
-    objective = jnp.sum(jnp.linalg.norm(r, axis=-1)) * scale
-    norms = jnp.linalg.norm(r.reshape(target.shape), axis=-1) * scale
-    bound = found.certificate.bound * scale
-    dual = found.certificate.dual.reshape(target.shape)
-    if norm == "squared":
-        gap = (objective - bound) * (objective + bound)
-        objective, bound, scale = objective**2, bound**2, scale**2
-    else:
-        gap = objective - bound
-    gap = jnp.maximum(gap, 0.0)
-    relative = jnp.where(objective > 0, gap / jnp.where(objective > 0, objective, 1.0), 0.0)
-    lower = bound.astype(dtype)
-    if single:  # a bound must not be rounded up
-        lower = jnp.where(lower.astype(bound.dtype) > bound, jnp.nextafter(lower, -jnp.inf), lower)
-    answer = Answer(
-        weights, objective, lower, gap, relative, scale, norms, dual,
-        found.rounds, found.steps, found.converged,
-    )  # fmt: skip
-    narrow = {
-        name: jax.lax.convert_element_type(value, dtype)
-        for name, value in answer._asdict().items()
-        if jnp.issubdtype(value.dtype, jnp.floating)
-    }
-    counts = {name: jnp.asarray(getattr(answer, name), jnp.int32) for name in ("rounds", "steps")}
-    return answer._replace(**narrow, **counts)
-
-
-def _sparse(points: Array, found: Found, tolerance: Array) -> Array:
-    """The weights without what the objective does not miss: the fewest that serve."""
-    best = found.weights
-    for share in (1e-8, 1e-6, 1e-4):
-        fewer = jnp.where(found.weights > share * jnp.max(found.weights), found.weights, 0.0)
-        fewer = fewer / jnp.sum(fewer)
-        objective = jnp.sum(jnp.linalg.norm(residuals(points, fewer), axis=-1))
-        limit = found.certificate.objective * (1.0 + 0.1 * tolerance)
-        best = jnp.where(objective <= limit, fewer, best)
-    return best
 
 
 def _double(x: Any) -> Array:

@@ -8,11 +8,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Float
 from jaxface.solvers.reduction import triangular_factor
-from jaxface.solvers.simplex import TOLERANCE, Answer, Method, Norm, solve
+from jaxface.solvers.simplex import TOLERANCE, Method, solve
+from jaxface.solvers.simplex_answer import Answer, Norm
+from jaxface.solvers.simplex_many import better, pays, solve_many
 from jaxface.stages.blend.columns import (
     blocks,
     check_database,
@@ -168,6 +171,8 @@ def blend_reduced(
     ``norm`` must be that of the reduction. Other arguments as in `blend`.
     """
     count = len(problem.targets)
+    if method == "working_set" and pays(count, len(problem.points)):
+        return _together(problem, start, norm, tolerance, dtype)
     starts: list[Any] = [None] * count
     if start is not None:
         starts = list(np.broadcast_to(np.asarray(start), (count, len(problem.points))))
@@ -181,3 +186,22 @@ def blend_reduced(
         )  # fmt: skip
         answers.append(jax.tree.map(np.asarray, answer))
     return jax.tree.map(lambda *values: np.stack(values), *answers)
+
+
+def _together(problem: Reduced, start: Any, norm: Norm, tolerance: float, dtype: str) -> Answer:
+    """All targets at once; those that are not solved so, one by one."""
+    shape = count, size = len(problem.targets), len(problem.points)
+    starts = np.full(shape, 1.0 / size) if start is None else np.broadcast_to(start, shape)
+    with jax.enable_x64(True):
+        data = (jnp.asarray(x, jnp.float64) for x in (*problem, starts, tolerance))
+        answer = solve_many(norm, dtype, *data)
+    answer = jax.tree.map(np.array, answer)
+    for number in np.flatnonzero(~answer.converged):
+        found = jax.tree.map(lambda x, i=number: x[i], answer)
+        alone = solve(
+            problem.points, problem.targets[number], found.weights,
+            norm=norm, tolerance=tolerance, dtype=dtype,
+        )  # fmt: skip
+        for whole, value in zip(answer, better(found, alone), strict=True):
+            whole[number] = value
+    return answer
