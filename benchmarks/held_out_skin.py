@@ -16,7 +16,7 @@ from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.completing import shrink
+from jaxface.pipeline.completion_levels import shrink
 from jaxface.pipeline.scan_import import import_scan
 from jaxface.pipeline.seen_texture import SeenTexture, seen_texture
 

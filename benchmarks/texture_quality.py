@@ -33,7 +33,8 @@ from jaxface.stages.blend import blend, nearest_subject, unconstrained
 from jaxface.stages.detail import COMPLEXION, with_complexion
 from jaxface.stages.synthesise import SynthesisWeights
 
-ITERATIONS = 60
+SIDE, ITERATIONS = 512, 60
+"""of the rows in results/texture_quality.json"""
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
         yield Variant("core", f"completed, {case}", case=case)
     for name, carry in (("None (the paper's)", None), ("0", 0.0), ("0.5", 0.5)):
         yield Variant("carry", name, {"carry": carry})
+    yield Variant("octaves", "as the photo's", {"match_octaves": True})
     networks = ["random-vgg19", *(["trained"] if TRAINED.is_file() else [])]
     three = {"layers": STYLE_LAYERS[:3]}
     for name in networks:
@@ -227,7 +229,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("/tmp/jaxface-quality-skins"))
     parser.add_argument("--vgg", type=Path, help="VGG-19 weights, to measure and to compare with")
     parser.add_argument("--only", default="", help="regular expression of 'group: name'")
-    parser.add_argument("--side", type=int, default=512)
+    parser.add_argument("--side", type=int, default=SIDE)
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -235,7 +237,9 @@ def main() -> None:
     jax.config.update("jax_compilation_cache_dir", None)
     bench = Bench(options)
     facts = dict(provenance(), side=options.side, iterations=options.iterations)
-    path = options.output / "texture_quality.json"
+    # Sizes do not mix in one table: an octave of texels is another one of millimetres.
+    size = "" if options.side == SIDE else f"_{options.side}"
+    path = options.output / f"texture_quality{size}.json"
 
     def keep(group: str, name: str, values: dict[str, float]) -> None:
         write_results(path, group, name, values, facts)

@@ -11,8 +11,9 @@ from jaxface.io.models import load_model
 from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.random_features import random_network
-from jaxface.pipeline.completing import CompletionSettings, complete, level_steps, shrink
+from jaxface.pipeline.completing import CompletionSettings, complete
 from jaxface.pipeline.completion_files import open_database, parse_settings
+from jaxface.pipeline.completion_levels import level_steps, shrink
 from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
 
 SIZE = 256
@@ -99,6 +100,29 @@ def test_the_unseen_half_gets_detail_and_the_seen_one_keeps_its_own(completed, s
     assert 0.5 < grain(albedo, right) / grain(seen.photo, left) < 2
     assert np.abs(albedo[left] - seen.photo[left]).mean() < 0.03
     assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1
+
+
+def test_hidden_detail_is_as_strong_as_what_the_photo_shows(model, base, database, network):
+    weight = np.zeros((SIZE, SIZE), np.float32)
+    weight[:, : SIZE // 2] = 1
+    coarse = seen_texture(
+        model, speckled(base, 0.4, 9), weight, np.zeros(model.albedo.count, np.float32), 1.0
+    )
+    right = coarse.free.copy()
+    right[:, : SIZE // 2 + 8] = False
+    left = coarse.free & (coarse.weight > 0.99)
+
+    def grain(texture, where):
+        fine = texture.mean(-1) - np.roll(texture.mean(-1), 1, axis=0)
+        return fine[where].std()
+
+    strength = {}
+    for match in (False, True):
+        settings = dataclasses.replace(SETTINGS, iterations=1, match_octaves=match)
+        found = complete(coarse, database, network, settings).start
+        strength[match] = grain(found, right) / grain(coarse.photo, left)
+    assert strength[False] < 0.9
+    assert abs(np.log(strength[True])) < 0.5 * abs(np.log(strength[False]))
 
 
 def test_eyes_and_mouth_are_left_alone(completed, seen):

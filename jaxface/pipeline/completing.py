@@ -17,6 +17,7 @@ from jaxface.imaging.resample import resize
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.feature_tiles import even_tile
 from jaxface.models.features import FeatureNetwork
+from jaxface.pipeline.completion_levels import level_steps, nearest_positive, shrink
 from jaxface.pipeline.completion_records import (
     Blending,
     Completed,
@@ -34,6 +35,7 @@ from jaxface.stages.detail import (
     with_photo,
     without_marks,
 )
+from jaxface.stages.octaves import with_photos_octaves
 from jaxface.stages.synthesise import SynthesisProblem, synthesise
 
 COARSEST = 256
@@ -178,8 +180,11 @@ class _Work:
             jnp.asarray(shrink(seen.plain[..., None], level)[..., 0]),
         )
 
-    def subject(self, index: int, level: int) -> Array:
-        """A subject's texture at a level, on the photo's complexion if the settings say so."""
+    def subject(self, index: int, level: int, strong: bool = True) -> Array:
+        """A subject's texture at a level, on the photo's complexion if the settings say so.
+
+        With ``strong`` also with detail as strong as the photo's: not where they are compared.
+        """
         texture = shrink(self.database.encoded(self.database.names[index]), level)
         if texture.shape[0] < level:
             texture = resize(jnp.asarray(texture), level, level)
@@ -187,7 +192,11 @@ class _Work:
             return jnp.asarray(texture)
         seen = self.maps(level)
         bare = without_marks(jnp.asarray(texture), seen.plain, level * COMPLEXION)
-        return with_complexion(bare, seen.low_frequency, level * COMPLEXION)
+        own = with_complexion(bare, seen.low_frequency, level * COMPLEXION)
+        if not (strong and self.settings.match_octaves):
+            return own
+        weight = seen.weight * seen.mask
+        return with_photos_octaves(own, seen.photo, weight, self._texels(level))
 
     def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
         """Gram matrices of a texture's intensity, masked out beyond a mask, in the box."""
@@ -206,12 +215,17 @@ class _Work:
         target = self.statistics(seen.photo, mask, level)
         stacks: dict[str, list[np.ndarray]] = {name: [] for name in target}
         for index in range(count):
-            for name, value in self.statistics(self.subject(index, level), mask, level).items():
+            for name, value in self.analysed(index, mask).items():
                 stacks[name].append(np.asarray(value))
             self.on_progress("analysis", index + 1, count, None)
         columns = {name: np.stack(values) for name, values in stacks.items()}
         goal = {name: np.asarray(value) for name, value in target.items()}
         return self.blending(columns, goal, norm=self.settings.norm)
+
+    def analysed(self, index: int, mask: np.ndarray) -> dict[str, Array]:
+        """A subject's Gram matrices as they are compared with the photo's."""
+        level = self.analysis_level
+        return self.statistics(self.subject(index, level, strong=False), mask, level)
 
     def targets(self, level: int, blended: Blend, used: list[int]) -> dict[str, Array]:
         """The complete Gram matrices ``sum_k w_k G(I_k)``."""
@@ -313,24 +327,3 @@ class _Work:
         inside = shrink(self.seen.inside[..., None].astype(np.float32), level)
         # Between the charts the nearest colours continue, so that a filter finds no dark rim.
         return np.asarray(push_pull(jnp.asarray(whole), jnp.asarray(inside[..., 0] > 0.99, float)))
-
-
-def nearest_positive(gram: Float[Array, "n n"]) -> Array:
-    """The nearest symmetric matrix without negative eigenvalues: differences may have some."""
-    values, vectors = jnp.linalg.eigh((gram + gram.T) / 2)
-    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
-
-
-def level_steps(iterations: int, levels: int) -> list[int]:
-    """Steps at each level, coarsest first: half as many at each finer one, one at least."""
-    shares = 0.5 ** np.arange(levels)
-    return [max(1, round(iterations * share)) for share in shares / shares.sum()]
-
-
-def shrink(texture: Float[np.ndarray, "r r c"], side: int) -> Float[np.ndarray, "s s c"]:
-    """Average over blocks of texels; a texture that is small enough already is left as it is."""
-    factor = max(len(texture) // side, 1)
-    if factor == 1:
-        return np.asarray(texture, np.float32)
-    blocks = np.asarray(texture, np.float32).reshape(side, factor, side, factor, -1)
-    return blocks.mean(axis=(1, 3))

@@ -15,7 +15,8 @@ from jaxface.io.overlay import contact_sheet
 from jaxface.io.report import write_report
 from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.pipeline.completing import Completed, shrink
+from jaxface.pipeline.completing import Completed
+from jaxface.pipeline.completion_levels import shrink
 from jaxface.pipeline.seen_texture import SeenTexture
 
 _FILES = {

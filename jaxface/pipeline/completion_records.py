@@ -34,6 +34,9 @@ class CompletionSettings:
     match_complexion: bool = True
     """compare and blend the subjects' detail on the photo's complexion; False: as in the paper,
     where tone counts too"""
+    match_octaves: bool = False
+    """whether subjects whose complexion is matched get each octave of detail as strong as the
+    photo's"""
     carry: float | None = 1.0
     """how far the hidden skin departs from the blend as the seen does; 0: the blend's as it is;
     None: as in the paper, where the seen skin's statistics are the blend's, too"""

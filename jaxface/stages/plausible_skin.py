@@ -79,7 +79,7 @@ def _plausible(
 
 
 def _bound(x: Array, below: Array | float, above: Array | float) -> Array:
-    """x as it is up to half a bound, from there softly held between ``-below`` and ``above``."""
+    """Keep x up to half a bound, and hold it softly between ``-below`` and ``above`` from there."""
     inner = jnp.clip(x, -0.5 * below, 0.5 * above)
     rest = 2 * (x - inner)
     negative, positive = jnp.minimum(rest, 0.0), jnp.maximum(rest, 0.0)

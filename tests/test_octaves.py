@@ -1,0 +1,41 @@
+"""Detail gets the strength that a photo shows."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxface.stages.octaves import octave_bands, with_photos_octaves
+
+SIDE = 128
+
+
+def grain(strength: float, seed: int) -> jnp.ndarray:
+    noise = np.random.default_rng(seed).standard_normal((SIDE, SIDE, 1))
+    return jnp.asarray(np.broadcast_to(0.5 + strength * noise, (SIDE, SIDE, 3)), jnp.float32)
+
+
+def test_bands_sum_to_what_the_last_blur_takes_away():
+    image = grain(0.1, 0)[..., 0]
+    bands = np.asarray(octave_bands(image))
+    wave = jnp.asarray(np.sin(2 * np.pi * np.arange(SIDE) / 12)[None].repeat(SIDE, 0), jnp.float32)
+    strength = np.asarray(octave_bands(wave))[:, 40:80, 40:80].std(axis=(1, 2))
+    assert bands.shape[0] == 4 and strength.argmax() == 2
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.6])
+def test_hidden_detail_is_as_strong_as_seen_detail(factor):
+    texture, photo = grain(0.03, 1), grain(0.03 * factor, 2)
+    weight = jnp.asarray((np.arange(SIDE) < 64)[None].repeat(SIDE, 0), jnp.float32)
+    found = np.asarray(with_photos_octaves(texture, photo, weight, 1.0))[..., 0]
+    before = np.asarray(texture)[..., 0]
+    for columns in (slice(10, 50), slice(80, 120)):
+        inner = slice(20, 108), columns
+        assert found[inner].std() / before[inner].std() == pytest.approx(factor, rel=0.06)
+
+
+def test_what_the_photo_does_not_resolve_stays():
+    texture, blurred = grain(0.03, 3), grain(0.0, 0)
+    found = with_photos_octaves(texture, blurred, jnp.ones((SIDE, SIDE)), 40.0)
+    np.testing.assert_allclose(found, texture, atol=1e-6)
+    unseen = with_photos_octaves(texture, blurred, jnp.zeros((SIDE, SIDE)), 1.0)
+    np.testing.assert_allclose(unseen, texture, atol=1e-3)
