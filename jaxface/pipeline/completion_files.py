@@ -21,7 +21,7 @@ from jaxface.io.texture_database import TextureDatabase, databases_dir
 from jaxface.pipeline.completing import Completed, CompletionSettings, Level, complete
 from jaxface.pipeline.completion_outputs import save_completed
 from jaxface.pipeline.seen_texture import SeenTexture, read_seen_texture
-from jaxface.pipeline.skin_database import synth_database
+from jaxface.pipeline.skin_database import PAINTING, synth_database
 from jaxface.stages.synthesise import SynthesisWeights
 
 PAINTED_MODEL = "makehuman"
@@ -116,7 +116,7 @@ def open_database(
             "a database in this model's UVs"
         )
     size = min(resolution, LARGEST_DATABASE)
-    folder = databases_dir() / f"procedural-{size}"
+    folder = databases_dir() / f"procedural-v{PAINTING}-{size}"
     return synth_database(
         folder, SUBJECTS, size, on_progress=lambda i, n: on_step("procedural skins", i, n)
     )

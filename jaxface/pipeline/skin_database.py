@@ -13,6 +13,9 @@ from jaxface.models.skin.attributes import random_attributes
 from jaxface.models.skin.regions import skin_fields
 from jaxface.models.skin.synthesis import synthesise_skin
 
+PAINTING = 2
+"""counts up when the same seed paints another skin, so that no cache mixes the two"""
+
 LICENCE = "CC0-1.0"
 CREDITS = ("procedural skin of jaxface over albedo statistics of MakeHuman skins (CC0)",)
 

@@ -5,16 +5,20 @@ import jax.numpy as jnp
 
 from jaxface._types import Array, Int
 from jaxface.models.skin.attributes import SkinAttributes
-from jaxface.models.skin.noise import gradient_noise, layer_seed, mix
+from jaxface.models.skin.noise import gradient_noise, layer_seed, mix, spectrum_noise, uniforms
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import Row, Vector, cross
+from jaxface.models.skin.rows import Row, Vector, cross, smoothstep
 from jaxface.models.skin.spots import Spot, gather_spots, likely, stroke
 
 STUBBLE_CELL, SCALP_CELL, BROW_CELL, DOWN_CELL = 1.0, 1.1, 5.0, 1.3
 """mm; a stroke is at most as long"""
 HALF_WIDTH = 0.09
 """mm, of a thick hair"""
+STUBBLE_WIDTH = 0.16
+"""mm, half the width at which a short hair and its root show: light spreads under the skin"""
+CLUMPS, CLUMPING = (2.5, 5.0, 10.0, 20.0), (0.2, 0.2, 0.22, 0.28)
+"""wavelengths (mm) at which a beard is denser or thinner, and how much (of its logarithm)"""
 
 
 def _strokes(
@@ -64,17 +68,19 @@ def _strokes(
 
 def stubble(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of the beard: strokes, and the blue-grey of the roots under the skin."""
-    patchy = gradient_noise(patch.position, 12.0, layer_seed(seed, 50))
+    clumps = spectrum_noise(patch.position, CLUMPS, CLUMPING, patch.texel, layer_seed(seed, 50))
+    thick = jnp.clip(jnp.exp(clumps), 0.3, 2.2)
     lean = 0.23 * gradient_noise(patch.position, 12.0, layer_seed(seed, 51))
-    where = jnp.clip(patch.regions.beard * (1.3 + 0.15 * patchy) - 0.1, 0.0, 1.0)
+    where = jnp.clip(patch.regions.beard * 1.3 - 0.1, 0.0, 1.0)
     grown = 0.25 + 0.75 * traits.stubble
+    chance = where * (0.35 + 0.65 * traits.stubble) * jnp.sqrt(jnp.sqrt(thick))
     hairs = _strokes(
-        patch, patch.hair, STUBBLE_CELL, where * (0.35 + 0.65 * traits.stubble), lean, 1.0,
-        (0.12, 0.12 + 0.36 * grown), HALF_WIDTH, layer_seed(seed, 52), layers=4,
+        patch, patch.hair, STUBBLE_CELL, chance, lean, 1.0,
+        (0.12, 0.12 + 0.36 * grown), STUBBLE_WIDTH, layer_seed(seed, 52), layers=4,
     )  # fmt: skip
     dark = (0.3 + 0.7 * traits.hair_melanin) * where**0.5
-    hairs = 1.8 * (0.35 + 0.65 * traits.stubble) * dark * hairs
-    shadow = 0.25 * traits.stubble * dark * where
+    hairs = 0.85 * (0.35 + 0.65 * traits.stubble) * dark * jnp.sqrt(thick) * hairs
+    shadow = 0.4 * traits.stubble * dark * where * thick
     # Roots seen through the skin look blue: melanin's share is negative to take away yellow.
     return Density(0.25 * hairs - 0.5 * shadow, -0.15 * shadow, 0.75 * hairs + 1.4 * shadow)
 
@@ -90,19 +96,26 @@ def brows(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Den
     flat = tuple(d - height * n for d, n in zip(direction, patch.normal, strict=True))
     inverse = 1.0 / jnp.sqrt(sum(d * d for d in flat) + 1e-6)
     direction = jax.lax.optimization_barrier(tuple(d * inverse for d in flat))
-    where = jnp.clip(1.4 * patch.regions.brow - 0.1, 0.0, 1.0)
+    # Subjects differ in how wide their brows are, and each brow is thicker in places.
+    wide, full, _ = uniforms(layer_seed(seed, 61))
+    thick = 1.1 + 1.1 * wide + 0.5 * traits.male + 0.2 * gradient_noise(
+        patch.position, 9.0, layer_seed(seed, 62)
+    )  # fmt: skip
+    where = smoothstep(thick * patch.regions.brow, 0.12, 0.9)
     hairs = _strokes(
-        patch, direction, BROW_CELL, where, jnp.zeros_like(x), 0.9, (1.2, 2.4), 0.12,
-        layer_seed(seed, 60), layers=16,
+        patch, direction, BROW_CELL, where * (0.55 + 0.45 * full), jnp.zeros_like(x), 0.9,
+        (1.2, 2.4), 0.12, layer_seed(seed, 60), layers=16,
     )  # fmt: skip
     amount = (0.4 + 0.6 * traits.hair_melanin) * (0.7 + 0.3 * traits.male)
-    return Density(0.3 * amount * hairs, 0.0, 0.8 * amount * hairs)
+    roots = 0.45 * where * full
+    return Density(amount * (0.3 * hairs + 0.3 * roots), 0.0, amount * (0.8 * hairs + 0.5 * roots))
 
 
 def scalp_roots(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
     """Density of shorn hair on the scalp."""
     patchy = gradient_noise(patch.position, 9.0, layer_seed(seed, 80))
-    where = jnp.clip(patch.regions.scalp * (1.1 + 0.07 * patchy) - 0.1, 0.0, 1.0)
+    # The scalp's weight falls off over the forehead, where hair is thin and then absent.
+    where = smoothstep(patch.regions.scalp + 0.05 * patchy, 0.35, 0.95)
     lean = 0.4 * gradient_noise(patch.position, 25.0, layer_seed(seed, 81))
     hairs = _strokes(
         patch, patch.hair, SCALP_CELL, where, lean, 0.8, (0.2, 0.5), HALF_WIDTH,
@@ -120,5 +133,5 @@ def down(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Dens
     hairs = _strokes(
         patch, patch.hair, DOWN_CELL, where, lean, 0.7, (0.3, 0.65), 0.17, layer_seed(seed, 91)
     )
-    pale = 0.05 * traits.furrows * hairs
+    pale = 0.032 * traits.furrows * hairs
     return Density(-0.5 * pale, -0.5 * pale)

@@ -11,9 +11,9 @@ from jaxface.models.skin.rows import smoothstep
 
 WAVES = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.55)
 """mm"""
-BLOOD = (0.028, 0.022, 0.017, 0.014, 0.014, 0.006, 0.002)
+BLOOD = (0.034, 0.028, 0.019, 0.013, 0.010, 0.006, 0.003)
 """standard deviation of the density of each wave"""
-MELANIN = (0.016, 0.012, 0.010, 0.010, 0.012, 0.005, 0.002)
+MELANIN = (0.018, 0.014, 0.011, 0.009, 0.009, 0.005, 0.003)
 
 
 def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:
@@ -22,7 +22,7 @@ def mottling(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> 
     melanin = spectrum_noise(patch.position, WAVES, MELANIN, patch.texel, layer_seed(seed, 2))
     r = patch.regions
     vivid = traits.mottling * (
-        1.0 + 0.4 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.35 * r.forehead
+        1.0 + 0.8 * r.cheek + 0.3 * r.nose + 0.2 * r.chin - 0.35 * r.forehead
     )
     return Density(traits.mottling * melanin, vivid * blood)
 
