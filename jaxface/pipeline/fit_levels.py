@@ -59,16 +59,17 @@ def fit_levels(
         (_start_program(), (data, models[0], weights, config))
     ]
     for level, model in enumerate(models):
-        if follows_shadows(model, config, level):
+        if follows_shadows(models, config, level):
             calls.append((_shadow_program(level), (y, data, model, models[0], config)))
         calls.append((_level_program(level), (y, data, model, weights, config)))
     clock.prepare("fit", calls)
     y, record = clock.run("fit", _start_program(), data, models[0], weights, config)
-    records, shadowed = [record], []
+    records, shadowed, occlusion = [record], [], None
     for level, model in enumerate(models):
-        if follows_shadows(model, config, level):
+        if follows_shadows(models, config, level):
             program = _shadow_program(level)
             y, occlusion = clock.run("fit", program, y, data, model, models[0], config)
+        if occlusion is not None:
             model = model.with_occlusion(occlusion)
         y, record = clock.run("fit", _level_program(level), y, data, model, weights, config)
         records.append(record)

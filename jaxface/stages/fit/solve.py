@@ -119,13 +119,15 @@ def fit_parameters(
     """
     y, first = fit_start(data, models[0], weights, config)
     records = [first]
+    occlusion = None
     for level, model in enumerate(models):
-        if follows_shadows(model, config, level):
+        if follows_shadows(models, config, level):
             y, occlusion = fit_shadows(y, data, model, models[0], config, level)
+        if occlusion is not None:
             model = model.with_occlusion(occlusion)
         y, record = fit_level(y, data, model, weights, config, level)
         records.append(record)
-    return y, join_records(records, model.model.occlusion)
+    return y, join_records(records, models[-1].model.occlusion if occlusion is None else occlusion)
 
 
 def fit_start(
@@ -137,12 +139,16 @@ def fit_start(
     return initial_light(y, image, mask, data, model), record
 
 
-def follows_shadows(model: FitModel, config: FitConfig, level: int) -> bool:
+def follows_shadows(models: tuple[FitModel, ...], config: FitConfig, level: int) -> bool:
     """Whether hard shadows are looked for before a level.
 
-    Not before the first, where the shape is still that of the landmarks alone.
+    Not before the first, where the shape is still that of the landmarks alone; before the second,
+    and again where a level has a finer mesh than the one before.
     """
-    return level > 0 and config.shadow_directions > 0 and model.model.occlusion is not None
+    if level == 0 or config.shadow_directions == 0 or models[level].model.occlusion is None:
+        return False
+    counts = [m.model.vertex_count for m in models]
+    return level == 1 or counts[level] != counts[level - 1]
 
 
 def fit_shadows(
