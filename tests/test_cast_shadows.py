@@ -158,7 +158,8 @@ def test_hidden_directions_against_rays():
     points = np.stack([rng.uniform(-60, 60, 200), rng.uniform(-60, 60, 200), np.zeros(200)], axis=1)
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     found = np.asarray(hidden_directions(
-        jnp.asarray(points), jnp.asarray(normals), model.mean, model.faces, directions=128, size=256
+        jnp.asarray(points), jnp.asarray(normals), model.mean, model.faces, sphere_lattice(128),
+        size=256,
     ))  # fmt: skip
     lattice = sphere_lattice(128)
     start = points + 2.0 * normals

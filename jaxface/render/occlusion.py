@@ -63,7 +63,7 @@ def self_occlusion(
         return total + taken[:, None] * sh_basis(direction), None
 
     start = jnp.zeros((len(vertices), 9), vertices.dtype)
-    total, _ = jax.lax.scan(add, start, _views(directions, vertices.dtype))
+    total, _ = jax.lax.scan(add, start, _views(sphere_lattice(directions), vertices.dtype))
     return -total * (4.0 / directions) / jnp.asarray(_LOBE, vertices.dtype)
 
 
@@ -72,12 +72,12 @@ def hidden_directions(
     normals: Float[Array, "p 3"],
     vertices: Float[Array, "n 3"],
     faces: Int[Array, "f 3"],
+    directions: Float[np.ndarray, "m 3"],
     *,
-    directions: int = 512,
     size: int = 128,
     offset: float = 2.0,
 ) -> Bool[Array, "p m"]:
-    """Whether a mesh hides each direction of the lattice from points on or near its surface.
+    """Whether a mesh hides each direction from points on or near its surface.
 
     Directions behind a point's own tangent plane are not asked for: what is said of them means
     nothing. No gradient passes.
@@ -87,7 +87,7 @@ def hidden_directions(
         normals: unit normals there.
         vertices: of the mesh that hides; it may be coarser than the surface that is asked for.
         faces: triangles, counter-clockwise seen from outside; both sides hide.
-        directions: number m of the ``sphere_lattice``.
+        directions: unit vectors towards the light.
         size: depth map's side, px; it spans the mesh.
         offset: mm along the normal from which a point looks, so that its own surface does not
             hide it.
@@ -97,9 +97,8 @@ def hidden_directions(
     return jax.lax.map(lambda view: hidden(*view), _views(directions, vertices.dtype)).T
 
 
-def _views(directions: int, dtype: Any) -> tuple[Array, Array]:
-    lattice = sphere_lattice(directions)
-    return jnp.asarray(lattice, dtype), jnp.asarray(_frames(lattice), dtype)
+def _views(directions: np.ndarray, dtype: Any) -> tuple[Array, Array]:
+    return jnp.asarray(directions, dtype), jnp.asarray(_frames(directions), dtype)
 
 
 def _hidden_from(

@@ -35,6 +35,9 @@ from jaxface.stages.fit.visible import visible_triangles
 SHADOWED = (0.1, 0.35)
 """share of the light that is hidden up to which a pixel counts fully, and from which not at all"""
 
+BEHIND = -0.5
+"""cosine to the camera below which light reaches next to nothing of what a photo shows"""
+
 SMOOTHING = 4
 """rounds of averaging over neighbours: a shadow's edge is known no better than some millimetres"""
 
@@ -76,7 +79,7 @@ def cast_shadows(
         data: the fit's input.
         model: level of detail; what it has as ``occlusion`` is the start.
         occluder: the model whose surface casts the shadows; the coarsest level of detail will do.
-        directions: m.
+        directions: m, over the whole sphere; those that come from far behind the face are left out.
         pixels: number of pixels (evenly spread) that are compared.
         rounds: of reweighting.
 
@@ -92,9 +95,11 @@ def cast_shadows(
     shape = face.shape(y.identity, y.expression)
     turned = shape @ rotation.T
     normals = vertex_normals(turned, face.faces)
-    lattice = jnp.asarray(sphere_lattice(directions), shape.dtype)
+    towards = sphere_lattice(directions)
+    towards = towards[towards[:, 2] > BEHIND]
+    lattice = jnp.asarray(towards, shape.dtype)
     casting = occluder.shape(y.identity, y.expression) @ rotation.T
-    hidden = hidden_directions(turned, normals, casting, occluder.faces, directions=directions)
+    hidden = hidden_directions(turned, normals, casting, occluder.faces, towards)
     samples = _samples(y, image, mask, data, model, pixels)
     camera = y.camera(samples.principal)
     rays = pixel_rays(samples.position, camera.focal, camera.principal)
@@ -115,11 +120,11 @@ def cast_shadows(
         scaled = weight[:, None] * albedo**2
         gram = jnp.stack([(lit * row[:, None]).T @ lit for row in scaled.T])
         moment = jnp.einsum("pc,pj->cj", weight[:, None] * albedo * samples.color, lit)
-        ridge = RIDGE * jnp.trace(gram, axis1=1, axis2=2)[:, None, None] / directions
-        gram = gram + ridge * jnp.eye(directions, dtype=gram.dtype)
+        ridge = RIDGE * jnp.trace(gram, axis1=1, axis2=2)[:, None, None] / len(towards)
+        gram = gram + ridge * jnp.eye(len(towards), dtype=gram.dtype)
         return jax.vmap(nonnegative_least_squares)(gram, moment).T, None
 
-    start = jnp.ones((directions, 3), shape.dtype)
+    start = jnp.ones((len(towards), 3), shape.dtype)
     radiance, _ = jax.lax.scan(reweighted, start, None, length=rounds)
 
     lost = jnp.maximum(normals @ lattice.T, 0.0) * hidden

@@ -37,7 +37,8 @@ class FitConfig(eqx.Module):
     landmark_steps: int = eqx.field(static=True, default=15)
     """steps on landmarks and prior alone, before the first level"""
     curvature_pixels: int = eqx.field(static=True, default=6000)
-    """pixels (evenly spread) on which the Jacobian is formed; the gradient uses all"""
+    """pixels (evenly spread) on which the Jacobian is formed, half as many before the last level;
+    the gradient uses all"""
     shadow_directions: int = eqx.field(static=True, default=256)
     """directions of light whose hard shadows are followed (``cast_shadows``); 0: soft ones only"""
     rtol: float = eqx.field(static=True, default=1e-5)

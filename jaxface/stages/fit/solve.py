@@ -176,10 +176,12 @@ def fit_level(
 ) -> tuple[FaceParameters, LevelRecord]:
     """One pyramid level (0 is the coarsest) from the parameters of the last."""
     energy = fit_energy(None, config.extra_terms)
+    # A coarse image has no more to say of the curvature than every other of its pixels.
+    pixels = config.curvature_pixels // (2 if level + 1 < len(config.steps) else 1)
     problem = Problem(
         energy=energy.value,
         quadratic=energy.quadratic,
-        refresh=lambda y, args: observe(y, *args, curvature_pixels=config.curvature_pixels),
+        refresh=lambda y, args: observe(y, *args, curvature_pixels=pixels),
     )
     image, mask = _level_image(data, len(config.steps), level)
     args = (image, mask, data, model, normal_modes(y, model.model, model.stencil), weights)
