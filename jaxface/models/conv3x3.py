@@ -1,8 +1,8 @@
 """The 3x3 convolution of VGG-like networks, as a JAX primitive with a fast CPU lowering.
 
 ``conv3x3`` is one linear operation to JAX: it differentiates in both modes to any order, and maps.
-How it is computed is decided when a program is lowered: on CPUs by Winograd's minimal filtering
-(``winograd``), for the first layer by ``shifted_sum``, elsewhere by ``lax.conv_general_dilated``.
+How it is computed is decided when a program is lowered: on CPUs wide layers by Winograd's minimal
+filtering (``winograd``), the first by ``shifted_sum``; all others by ``lax.conv_general_dilated``.
 """
 
 import functools
@@ -20,10 +20,11 @@ from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_
 from jaxface.models.winograd import winograd_conv3x3
 
 METHODS = ("auto", "winograd", "direct")
-"""``auto``: on CPUs by Winograd, or by shifted sums for the first layer; direct elsewhere"""
+"""``auto``: on CPUs wide layers by Winograd, the first by shifted sums; direct elsewhere"""
 
-_NARROW, _WIDE = 2, 16
-"""on CPUs ``auto`` means shifted sums up to the one, Winograd from the other number of channels"""
+_NARROW, _WIDE = 2, 64
+"""on CPUs ``auto`` means shifted sums up to the one, Winograd from the other number of channels;
+the fewer channels, the more of Winograd's time are its transforms, on one core"""
 
 
 def conv3x3(

@@ -156,7 +156,10 @@ def _surface_hits(
     """
     triangle = np.asarray(image.fragments.triangle)
     outside = (triangle >= 0) & (np.asarray(image.normals)[..., 2] > np.cos(np.radians(STEEPEST)))
-    away, (rows, columns) = distance_transform_edt(~outside, return_indices=True)
+    away = np.asarray(distance_transform_edt(~outside))
+    rows, columns = np.asarray(
+        distance_transform_edt(~outside, return_distances=False, return_indices=True)
+    )
     column, row = np.clip(points.astype(int), 0, np.array(triangle.shape[::-1]) - 1).T
     far = away[row, column]
     row, column = rows[row, column], columns[row, column]
