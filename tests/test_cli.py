@@ -75,7 +75,8 @@ def test_landmarks_of_the_demo(tmp_path):
     record = json.loads((tmp_path / "landmarks_0.json").read_text())
     assert len(record["points"]) == 68
     assert (tmp_path / "landmarks_0.pts").is_file()
-    assert Image.open(tmp_path / "landmarks.png").size == (512, 512)
+    with Image.open(tmp_path / "landmarks.png") as picture:
+        assert picture.size == (512, 512)
 
 
 def test_model_info_json():

@@ -74,7 +74,7 @@ def complete_folder(
     seen = read_seen_texture(place, resolution, model)
     textures = open_database(database, model or seen.model.name, seen.resolution, on_step)
     work = _Checkpoint(place, settings, network.name, textures, seen)
-    shown = time.perf_counter()
+    shown = -PREVIEW_SECONDS  # the first picture is shown at once
 
     def on_progress(
         what: str, done: int, of: int, picture: Callable[[], Float[np.ndarray, "h w 3"]] | None
