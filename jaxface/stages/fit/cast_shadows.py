@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxface._numerics import safe_norm
 from jaxface._types import Array, Float
-from jaxface.energies.photometric import PixelSamples, reweighting, sample_pixels, thin_samples
+from jaxface.energies.photometric import PixelSamples, reweighting, thin_samples
 from jaxface.geometry.mesh import smooth_over_mesh, vertex_normals
 from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import rotation_matrix
@@ -30,7 +30,7 @@ from jaxface.render.shading import irradiance, sh_basis
 from jaxface.solvers.nonnegative import nonnegative_least_squares
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitInput
-from jaxface.stages.fit.visible import visible_triangles
+from jaxface.stages.fit.visible import visible_samples
 
 SHADOWED = (0.1, 0.35)
 """share of the light that is hidden up to which a pixel counts fully, and from which not at all"""
@@ -100,7 +100,7 @@ def cast_shadows(
     lattice = jnp.asarray(towards, shape.dtype)
     casting = occluder.shape(y.identity, y.expression) @ rotation.T
     hidden = hidden_directions(turned, normals, casting, occluder.faces, towards)
-    samples = _samples(y, image, mask, data, model, pixels)
+    samples = thin_samples(visible_samples(y, image, mask, data, model), pixels)
     camera = y.camera(samples.principal)
     rays = pixel_rays(samples.position, camera.focal, camera.principal)
     share = ray_weights(rays, turned[samples.triangle] + y.translation)
@@ -161,17 +161,6 @@ def shadow_trust(
     whole = jnp.mean(irradiance(normals, y.light), axis=-1)
     share = jnp.maximum(lost, 0.0) / jnp.maximum(whole, 1e-3)
     return 1.0 - smoothstep(jnp.mean(share[samples.triangle], axis=-1), *SHADOWED)
-
-
-def _samples(
-    y: FaceParameters, image: Array, mask: Array, data: FitInput, model: FitModel, pixels: int
-) -> PixelSamples:
-    size = image.shape[0]
-    triangle = visible_triangles(y, model, data.principal, size)
-    samples = sample_pixels(
-        image, mask, triangle, model.model.faces, model.face_mask, data.principal, size * size // 2
-    )
-    return thin_samples(samples, pixels)
 
 
 def _weights(samples: PixelSamples, synth: Array) -> Array:

@@ -24,7 +24,6 @@ from jaxface.energies.landmark import (
 from jaxface.energies.photometric import (
     PhotometricData,
     photometric_energy,
-    sample_pixels,
     synthesize,
     thin_samples,
 )
@@ -53,7 +52,7 @@ from jaxface.stages.fit.records import (
     LevelRecord,
     join_records,
 )
-from jaxface.stages.fit.visible import visible_triangles
+from jaxface.stages.fit.visible import visible_samples
 
 
 def fit_energy(weights: FitWeights | None = None, extra_terms: Sequence[Term] = ()) -> Energy:
@@ -127,7 +126,7 @@ def fit_parameters(
             model = model.with_occlusion(occlusion)
         y, record = fit_level(y, data, model, weights, config, level)
         records.append(record)
-    return y, join_records(records, models[-1].model.occlusion if occlusion is None else occlusion)
+    return y, join_records(records, model.model.occlusion)
 
 
 def fit_start(
@@ -216,13 +215,7 @@ def observe(
     No gradient passes: visibility and inliers are choices, held fixed by every derivative.
     """
     y = jax.lax.stop_gradient(y)
-    size = image.shape[0]
-    triangle = visible_triangles(y, model, data.principal, size)
-    faces = model.model.faces
-
-    samples = sample_pixels(
-        image, mask, triangle, faces, model.face_mask, data.principal, size * size // 2
-    )
+    samples = visible_samples(y, image, mask, data, model)
     trusted = shadow_trust(y, model.model, samples)
     samples = eqx.tree_at(lambda s: s.weight, samples, samples.weight * trusted)
     synth = synthesize(y, model.model, samples)
