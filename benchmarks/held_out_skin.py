@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filte
 from jaxface._types import Array, Bool, Float
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
+from jaxface.imaging.masks import smoothstep
 from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.morphable import MorphableModel
@@ -147,8 +148,7 @@ def make_case(truth: Float[np.ndarray, "r r 3"], name: str) -> Case:
     else:
         raise ValueError(f"case is {name!r}; needed is 'left', 'right' or 'oval'")
     depth = distance_transform_edt(inside & everything.skin) / (EDGE * side)
-    t = np.clip(depth, 0, 1)
-    weight = (t * t * (3 - 2 * t)).astype(np.float32) * free
+    weight = smoothstep(depth, 0.0, 1.0).astype(np.float32) * free
     seen = seen_texture(model, linear, weight, coefficients(model, truth, weight), 1.0)
     region = np.asarray(model.region)[seen.vertex_of]
     skipped = [model.region_names.index(n) for n in NOT_MEASURED]

@@ -14,7 +14,15 @@ from jaxface.imaging.colour import linear_to_srgb, rgb_to_yiq
 from jaxface.models.random_features import random_network
 from jaxface.pipeline.differentiable import TextureProblem, TextureWeights, infer_texture
 from jaxface.render.image import render
-from jaxface.stages.fit import FitConfig, FitInput, FitModel, FitWeights
+from jaxface.stages.fit import (
+    FitConfig,
+    FitInput,
+    FitModel,
+    FitWeights,
+    fit_hidden_shading,
+    fit_parameters,
+)
+from jaxface.stages.unwrap import unwrap
 from tests.small_scene import small_model, small_parameters
 
 SIZE, RESOLUTION = 32, 24
@@ -120,3 +128,28 @@ def test_gradient_from_texture_to_photo_and_weights(case):
         check((zero[0], zero[1], alpha), 1e-5, 1e-4)
         layer = eqx.tree_at(lambda w: w.layers["conv2_1"], zero[2], jnp.asarray(1.0))
         check((zero[0], zero[1], layer), 1e-5, 1e-3)
+
+
+@pytest.mark.slow
+def test_albedo_is_freed_of_the_shadows_that_the_fit_saw(case):
+    photo, fit_weights, weights, problem = case
+    with jax.enable_x64(True):
+        shadowed = problem.models[0].with_occlusion(
+            jnp.zeros((problem.models[0].model.vertex_count, 9)).at[:, 0].set(-0.05)
+        )
+        problem = dataclasses.replace(problem, models=(shadowed, shadowed))
+        config = FitConfig(steps=(2, 2), landmark_steps=4, shadow_directions=32)
+        y, stats = jax.jit(fit_parameters)(photo, problem.models, fit_weights, config)
+        found = jax.jit(infer_texture)(photo, fit_weights, weights, problem, config)
+
+        def freed(occlusion):
+            model = shadowed.with_occlusion(occlusion).model
+            shape = y.pose(model.shape(y.identity, y.expression))
+            return unwrap(
+                photo.image, photo.mask, shape, model.faces, y.camera(photo.principal, SIZE),
+                y.light, problem.layout, fit_hidden_shading(y, model), tile=RESOLUTION,
+            ).albedo  # fmt: skip
+
+        np.testing.assert_allclose(found.partial.albedo, freed(stats.occlusion), atol=1e-9)
+        soft = freed(shadowed.model.occlusion)
+        assert float(jnp.max(jnp.abs(found.partial.albedo - soft))) > 1e-3

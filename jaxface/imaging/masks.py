@@ -1,11 +1,15 @@
 """Masks of an image: filled polygons, erosion and dilation by a disc, soft edges, the face oval."""
 
 import math
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Bool, Float, Shaped
+
+Values = TypeVar("Values", Array, np.ndarray)
 
 FACE_OVAL_468 = (
     *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377),
@@ -14,11 +18,15 @@ FACE_OVAL_468 = (
 """The rim of the 468-point MediaPipe face mesh, in order from the middle of the hairline."""
 
 
-def smoothstep(
-    x: Float[Array, "*s"], start: float | Float[Array, ""], stop: float | Float[Array, ""]
-) -> Float[Array, "*s"]:
-    """0 up to ``start``, 1 from ``stop``, the cubic ``t^2 (3 - 2 t)`` between (slope 0 at both)."""
-    t = jnp.clip((x - start) / (stop - start), 0.0, 1.0)
+def smoothstep(x: Values, start: float | Values, stop: float | Values) -> Values:
+    """0 up to ``start``, 1 from ``stop``, the cubic ``t^2 (3 - 2 t)`` between (slope 0 at both).
+
+    Args:
+        x: of any shape; an array of NumPy stays one.
+        start: of a shape that broadcasts with that of ``x``.
+        stop: likewise.
+    """
+    t = ((x - start) / (stop - start)).clip(0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxface._types import Array, Float
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.morphable import MorphableModel
 
 LID_SHADE = 0.85
@@ -49,19 +50,14 @@ def opening_rims(model: MorphableModel) -> OpeningRims:
     if "eyelids" in names:
         lids = np.asarray(model.region_mask("eyelids"))
         redness = np.log(np.maximum(albedo[:, 0], 1e-3) / np.maximum(albedo[:, 1], 1e-3))
-        pocket = lids * _step(redness - np.quantile(redness[lids], 0.3), 0.2, 0.6)
+        pocket = lids * smoothstep(redness - np.quantile(redness[lids], 0.3), 0.2, 0.6)
         lid = lids * (1 - pocket)
     if "lips" in names and "mouth_interior" in names:
         lips, interior = (np.asarray(model.region_mask(n)) for n in ("lips", "mouth_interior"))
         mean = np.asarray(model.mean, np.float64)
         distance = np.asarray(KDTree(mean[interior]).query(mean)[0])
         tone = albedo.mean(axis=1) / np.median(albedo[lips].mean(axis=1))
-        pale = lips * _step(-distance, -RIM[1], -RIM[0]) * _step(tone, 1.05, 1.25)
+        pale = lips * smoothstep(-distance, -RIM[1], -RIM[0]) * smoothstep(tone, 1.05, 1.25)
         lip = lips * (np.abs(tone - 1) < 0.15)
     parts = pocket, lid / max(lid.sum(), 1e-6), pale, lip / max(lip.sum(), 1e-6)
     return OpeningRims(*(jnp.asarray(part, jnp.float32) for part in parts))
-
-
-def _step(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)

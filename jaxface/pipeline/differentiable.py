@@ -94,8 +94,11 @@ def infer_texture(
         steps: of the synthesis.
         rate: largest change of an intensity in one step.
     """
-    y, _ = fit_parameters(photo, problem.models, fit_weights, config)
-    model = problem.models[-1].model
+    y, stats = fit_parameters(photo, problem.models, fit_weights, config)
+    finest = problem.models[-1]
+    if stats.occlusion is not None:
+        finest = finest.with_occlusion(stats.occlusion)
+    model = finest.model
     size = photo.image.shape[0]
     partial = unwrap(
         photo.image, jax.lax.stop_gradient(photo.mask),

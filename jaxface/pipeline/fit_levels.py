@@ -1,6 +1,7 @@
 """The levels of a fit as programs, compiled side by side and kept between processes."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,25 +20,14 @@ from jaxface.stages.fit import (
     fit_shadows,
     fit_start,
     follows_shadows,
-    join_records,
+    through_levels,
 )
 
 
 @functools.cache
-def _start_program() -> KeptProgram:
-    return KeptProgram("fit_start", fit_start, quick_compilation())
-
-
-@functools.cache
-def _level_program(level: int) -> KeptProgram:
-    function = functools.partial(fit_level, level=level)
-    return KeptProgram(f"fit_level_{level}", function, quick_compilation())
-
-
-@functools.cache
-def _shadow_program(level: int) -> KeptProgram:
-    function = functools.partial(fit_shadows, level=level)
-    return KeptProgram(f"fit_shadows_{level}", function, quick_compilation())
+def _program(stage: Callable[..., Any], level: int) -> KeptProgram:
+    function = functools.partial(stage, level=level)
+    return KeptProgram(f"{stage.__name__}_{level}", function, quick_compilation())
 
 
 def fit_levels(
@@ -56,22 +46,15 @@ def fit_levels(
     keep_structure(y)
     keep_structure(LevelRecord({}, y.log_focal, y.identity))
     calls: list[tuple[KeptProgram, tuple[Any, ...]]] = [
-        (_start_program(), (data, models[0], weights, config))
+        (_program(fit_start, 0), (data, models[0], weights, config))
     ]
     for level, model in enumerate(models):
         if follows_shadows(models, config, level):
-            calls.append((_shadow_program(level), (y, data, model, models[0], config)))
-        calls.append((_level_program(level), (y, data, model, weights, config)))
+            calls.append((_program(fit_shadows, level), (y, data, model, models[0], config)))
+        calls.append((_program(fit_level, level), (y, data, model, weights, config)))
     clock.prepare("fit", calls)
-    y, record = clock.run("fit", _start_program(), data, models[0], weights, config)
-    records, shadowed, occlusion = [record], [], None
-    for level, model in enumerate(models):
-        if follows_shadows(models, config, level):
-            program = _shadow_program(level)
-            y, occlusion = clock.run("fit", program, y, data, model, models[0], config)
-        if occlusion is not None:
-            model = model.with_occlusion(occlusion)
-        y, record = clock.run("fit", _level_program(level), y, data, model, weights, config)
-        records.append(record)
-        shadowed.append(model)
-    return y, join_records(records, shadowed[-1].model.occlusion), tuple(shadowed)
+
+    def call(stage: Callable[..., Any], level: int, *args: Any) -> Any:
+        return clock.run("fit", _program(stage, level), *args)
+
+    return through_levels(data, models, weights, config, call)

@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from jaxface._types import Bool, Float
 from jaxface.geometry.uv import UVLayout, uv_layout
+from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.resample import resize
 from jaxface.io.exr import read_exr, srgb_encoded
 from jaxface.io.fit_file import read_fit
@@ -195,8 +196,7 @@ def _off_openings(
         return np.ones(opening.shape, np.float32)
     margin = 1.5 * texels_per_pixel + layout.resolution / 512
     distance = np.asarray(distance_transform_edt(~opening))
-    t = np.clip(distance / margin - 1, 0, 1)
-    return np.asarray(t * t * (3 - 2 * t), np.float32)
+    return np.asarray(smoothstep(distance, margin, 2 * margin), np.float32)
 
 
 def _may_be_dark(

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Int
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed, mix, spectrum_noise, uniforms
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import Row, Vector, cross, smoothstep
+from jaxface.models.skin.rows import Row, Vector, cross
 from jaxface.models.skin.spots import Spot, gather_spots, likely, stroke
 
 STUBBLE_CELL, SCALP_CELL, BROW_CELL, DOWN_CELL = 1.0, 1.1, 5.0, 1.3

@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 
 from jaxface._types import Array, Int
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import Row, smoothstep
+from jaxface.models.skin.rows import Row
 from jaxface.models.skin.spots import Spot, gather_spots, likely
 
 

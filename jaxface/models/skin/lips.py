@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 
 from jaxface._types import Array, Int
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed, visible
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import Row, smoothstep
+from jaxface.models.skin.rows import Row
 
 
 def lips(patch: SkinPatch, traits: SkinAttributes, seed: Int[Array, ""]) -> Density:

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 
 from jaxface._types import Array, Int
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed, spectrum_noise
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import smoothstep
 
 WAVES = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.55)
 """mm"""

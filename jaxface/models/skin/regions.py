@@ -10,6 +10,7 @@ import numpy as np
 from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_neighbours, vertex_normals
 from jaxface.imaging.colour import LUMINANCE
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.opening_rims import OpeningRims, opening_rims
 
@@ -103,7 +104,7 @@ def _regions(
         rim = np.maximum(rim, interior * (_smooth(rim, neighbours, 1) > 0))
 
     x, y, z = position.T
-    front = _step(z, marks[0, 2], marks[0, 2] + 30)
+    front = smoothstep(z, marks[0, 2], marks[0, 2] + 30)
     skin = np.maximum(1 - named(*NOT_SKIN, passes=0), rim)
     lips = _smooth(rim, neighbours, 2)
     lid = named("eyelids", passes=2) * skin
@@ -118,12 +119,14 @@ def _regions(
         cheeks.append(_near(position, middle[None], 20.0))
         below = marks[40:42] if side < 0 else marks[46:48]
         under.append(_near(position, _polyline(below + [2.0 * side, -7.0, 0]), 5.5))
-    forehead = front * _step(y, marks[19, 1] + 2, marks[19, 1] + 12) * (1 - _step(y, 58, 80))
+    forehead = (
+        front * smoothstep(y, marks[19, 1] + 2, marks[19, 1] + 12) * (1 - smoothstep(y, 58, 80))
+    )
     jaw_line = _polyline(marks[1:16])
     # The beard's upper border runs from the ear lobe to the corner of the mouth.
     border = marks[3, 1] + (np.abs(x) / abs(marks[3, 0])) ** 2 * (marks[1, 1] - marks[3, 1])
-    beard = _near(position, jaw_line, 26.0) * (1 - _step(y, border - 8, border + 10))
-    throat = _step(y, marks[8, 1] - 45, marks[8, 1] - 15)
+    beard = _near(position, jaw_line, 26.0) * (1 - smoothstep(y, border - 8, border + 10))
+    throat = smoothstep(y, marks[8, 1] - 45, marks[8, 1] - 15)
     moustache = _near(
         position, _polyline(0.55 * marks[31:36] + 0.45 * marks[[49, 50, 51, 52, 53]]), 6.0
     )
@@ -161,7 +164,7 @@ def _where_dark(albedo: np.ndarray, window: np.ndarray, around: np.ndarray) -> n
     deepest = np.max(darkness * (window > 0.5), initial=0.0)
     if deepest < 0.15:
         return window
-    return np.sqrt(window) * _step(darkness / deepest, 0.1, 0.8)
+    return np.sqrt(window) * smoothstep(darkness / deepest, 0.1, 0.8)
 
 
 def _tension(position: np.ndarray, marks: np.ndarray) -> np.ndarray:
@@ -172,7 +175,7 @@ def _tension(position: np.ndarray, marks: np.ndarray) -> np.ndarray:
     """
     offset = position[:, :2]
     side = np.sign(offset[:, 0])
-    angle = [(np.zeros(len(offset)), _step(position[:, 1], 15, 30) + 0.05)]
+    angle = [(np.zeros(len(offset)), smoothstep(position[:, 1], 15, 30) + 0.05)]
     for eye in (marks[36:42].mean(0), marks[42:48].mean(0)):
         away = offset - eye[:2]
         around = np.arctan2(away[:, 1], away[:, 0]) + np.pi / 2
@@ -181,7 +184,7 @@ def _tension(position: np.ndarray, marks: np.ndarray) -> np.ndarray:
     angle.append((np.arctan2(mouth[:, 1] / 0.6, mouth[:, 0]) + np.pi / 2,
                   1.2 * np.exp(-0.5 * np.sum((mouth / [26, 18]) ** 2, axis=1))))  # fmt: skip
     cheek = np.arctan2(-0.85 * np.ones(len(side)), 0.5 * side)
-    angle.append((cheek, 0.5 * (1 - _step(position[:, 1], -15, 10))))
+    angle.append((cheek, 0.5 * (1 - smoothstep(position[:, 1], -15, 10))))
     axes = [w[:, None] * np.stack([np.cos(2 * a), np.sin(2 * a)], axis=1) for a, w in angle]
     axis = np.sum(axes, axis=0)
     half = 0.5 * np.arctan2(axis[:, 1], axis[:, 0])
@@ -209,11 +212,6 @@ def _spacing(model: MorphableModel, position: np.ndarray) -> np.ndarray:
     surface = np.bincount(faces.ravel(), np.repeat(area, 3), count)
     texture = np.bincount(faces.ravel(), np.repeat(flat, 3), count)
     return np.sqrt(surface / np.maximum(texture, 1e-12))
-
-
-def _step(x: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> np.ndarray:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)
 
 
 def _near(position: np.ndarray, points: np.ndarray, width: float) -> np.ndarray:

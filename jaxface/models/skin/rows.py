@@ -30,9 +30,3 @@ def unit(a: Vector) -> Vector:
     """The vector at length 1."""
     inverse = jax.lax.rsqrt(jnp.maximum(dot(a, a), 1e-12))
     return (a[0] * inverse, a[1] * inverse, a[2] * inverse)
-
-
-def smoothstep(x: Row, low: float | Row, high: float | Row) -> Row:
-    """0 below ``low``, 1 above ``high``, a cubic between."""
-    t = jnp.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Int
+from jaxface.imaging.masks import smoothstep
 from jaxface.models.skin.attributes import SkinAttributes
 from jaxface.models.skin.noise import gradient_noise, layer_seed
 from jaxface.models.skin.patch import SkinPatch
 from jaxface.models.skin.pigments import Density
-from jaxface.models.skin.rows import Row, smoothstep
+from jaxface.models.skin.rows import Row
 
 _FOREHEAD = np.array([0.6, 1.0, 0.85, 0.5], np.float32)
 _RAYS = np.radians(np.array([-38.0, -17.0, 3.0, 24.0, 44.0], np.float32))

@@ -12,7 +12,6 @@ from jaxface.stages.fit.records import (
     FitStats,
     FitWeights,
     LevelRecord,
-    join_records,
 )
 from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
 from jaxface.stages.fit.solve import (
@@ -22,6 +21,7 @@ from jaxface.stages.fit.solve import (
     fit_shadows,
     fit_start,
     follows_shadows,
+    through_levels,
 )
 
 __all__ = [
@@ -44,10 +44,10 @@ __all__ = [
     "fit_shadows",
     "fit_start",
     "follows_shadows",
-    "join_records",
     "posterior",
     "prepare",
     "render_fit",
     "skin_map",
+    "through_levels",
     "working_photo",
 ]

@@ -61,6 +61,5 @@ def fit_batch(
     data = jax.device_put(data, NamedSharding(mesh, PartitionSpec("photo")))
     everywhere = NamedSharding(mesh, PartitionSpec())
     models, weights = jax.device_put((models, weights), everywhere)
-    with mesh:
-        answer = _fit_all(data, models, weights, config)
+    answer = _fit_all(data, models, weights, config)
     return jax.tree.map(lambda x: x[:count], answer)

@@ -6,7 +6,7 @@ rasteriser finds what is visible again before every step.
 """
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -116,25 +116,51 @@ def fit_parameters(
     Returns:
         The parameters and the history.
     """
-    y, first = fit_start(data, models[0], weights, config)
-    records = [first]
-    occlusion = None
+    y, stats, _ = through_levels(
+        data, models, weights, config, lambda stage, level, *args: stage(*args, level)
+    )
+    return y, stats
+
+
+def through_levels(
+    data: FitInput,
+    models: tuple[FitModel, ...],
+    weights: FitWeights,
+    config: FitConfig,
+    call: Callable[..., Any],
+) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
+    """The stages of ``fit_parameters`` in their order, each made by ``call``.
+
+    Args:
+        data: working image and landmarks.
+        models: the model at each level of detail, coarsest first.
+        weights: term weights.
+        config: steps and sizes.
+        call: ``call(stage, level, *args)`` with the answer of ``stage(*args, level)``, where stage
+            is ``fit_start``, ``fit_shadows`` or ``fit_level``.
+
+    Returns:
+        Parameters, history, and the models with the shadows that they were fitted with.
+    """
+    y, record = call(fit_start, 0, data, models[0], weights, config)
+    records, shadowed, occlusion = [record], [], None
     for level, model in enumerate(models):
         if follows_shadows(models, config, level):
-            y, occlusion = fit_shadows(y, data, model, models[0], config, level)
+            y, occlusion = call(fit_shadows, level, y, data, model, models[0], config)
         if occlusion is not None:
             model = model.with_occlusion(occlusion)
-        y, record = fit_level(y, data, model, weights, config, level)
+        y, record = call(fit_level, level, y, data, model, weights, config)
         records.append(record)
-    return y, join_records(records, model.model.occlusion)
+        shadowed.append(model)
+    return y, join_records(records, shadowed[-1].model.occlusion), tuple(shadowed)
 
 
 def fit_start(
-    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
+    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig, level: int = 0
 ) -> tuple[FaceParameters, LevelRecord]:
     """Before the first level: pose and coefficients from the landmarks, light in closed form."""
     y, record = fit_landmarks(data, model, weights, config)
-    image, mask = _level_image(data, len(config.steps), 0)
+    image, mask = _level_image(data, len(config.steps), level)
     return initial_light(y, image, mask, data, model), record
 
 
