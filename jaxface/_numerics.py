@@ -1,25 +1,37 @@
 """A small vocabulary of functions that stay finite, in value and in derivative, everywhere."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float, Shaped
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def safe_norm(
     x: Float[Array, "*batch d"], axis: int = -1, keepdims: bool = False
 ) -> Float[Array, "*batch"]:
-    """Euclidean norm whose derivative at the origin is zero instead of NaN.
+    """Euclidean norm whose derivatives at the origin are zero instead of NaN.
 
     The input is scaled by its largest entry, so neither squares of tiny values underflow nor
     squares of huge ones overflow.
     """
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
-    zero = scale == 0
-    scaled = x / jnp.where(zero, 1.0, scale)
-    squared = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
-    norm = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)) * scale)
+    scale = jnp.max(jnp.abs(x), axis=axis, keepdims=True)
+    scaled = x / jnp.where(scale == 0, 1.0, scale)
+    norm = jnp.sqrt(jnp.sum(scaled * scaled, axis=axis, keepdims=True)) * scale
     return norm if keepdims else jnp.squeeze(norm, axis)
+
+
+@safe_norm.defjvp
+def _safe_norm_jvp(
+    axis: int, keepdims: bool, primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[Array, Array]:
+    (x,), (moved,) = primals, tangents
+    norm = safe_norm(x, axis, True)
+    slope = x * jnp.where(norm > 0, 1.0 / jnp.where(norm > 0, norm, 1.0), 0.0)
+    change = jnp.sum(slope * moved, axis=axis, keepdims=True)
+    return (norm, change) if keepdims else (jnp.squeeze(norm, axis), jnp.squeeze(change, axis))
 
 
 def safe_normalize(x: Float[Array, "*batch d"], axis: int = -1) -> Float[Array, "*batch d"]:
@@ -34,6 +46,12 @@ def safe_divide(
     """``numerator / denominator``, and ``fill`` (derivative zero) where the denominator is 0."""
     zero = denominator == 0
     return jnp.where(zero, fill, numerator / jnp.where(zero, 1.0, denominator))
+
+
+def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Cross product, of operations that XLA fuses; `jnp.cross` cuts its vectors into columns."""
+    products = a * jnp.roll(b, -1, axis=-1) - jnp.roll(a, -1, axis=-1) * b
+    return jnp.roll(products, -1, axis=-1)
 
 
 def safe_sqrt(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

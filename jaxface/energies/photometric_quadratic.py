@@ -19,6 +19,7 @@ Jacobian carries the whole mesh through each of some 250 columns.
 import jax
 import jax.numpy as jnp
 
+from jaxface._numerics import cross
 from jaxface._types import Array, Float
 from jaxface.energies.photometric import (
     PhotometricData,
@@ -34,7 +35,7 @@ from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.render.occlusion import hidden_shading, sh_rotation
-from jaxface.render.shading import irradiance, sh_basis
+from jaxface.render.shading import irradiance, irradiance_slope, sh_basis
 
 
 def shape_basis(model: MorphableModel) -> Float[Array, "n 3 k"]:
@@ -103,20 +104,15 @@ def photometric_jacobian(
         shading = shading + _interpolate(b, hidden, tri)
 
     # D: colour change for a change of the interpolated normal m.
-    per_axis = [
-        jax.jvp(lambda v: irradiance(v, y.light), (n,), (jnp.broadcast_to(e, n.shape),))[1]
-        for e in jnp.eye(3, dtype=n.dtype)
-    ]
-    shading_slope = jnp.stack(per_axis, axis=-1)  # (p, colour, xyz)
-    d = a[:, :, None] * shading_slope
+    d = a[:, :, None] * irradiance_slope(n, y.light)
     d = (d - (d @ n[:, :, None]) * n[:, None, :]) / m_norm[:, :, None]
 
     # Gradients of the weights in the triangle's plane: tau -> db_i = beta_i . tau.
     edge1, edge2 = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
-    g = jnp.cross(edge1, edge2)
+    g = cross(edge1, edge2)
     area2 = jnp.sum(g * g, axis=-1, keepdims=True)
     inverse = jnp.where(area2 > 0, 1.0 / jnp.where(area2 > 0, area2, 1.0), 0.0)
-    beta1, beta2 = jnp.cross(edge2, g) * inverse, jnp.cross(g, edge1) * inverse
+    beta1, beta2 = cross(edge2, g) * inverse, cross(g, edge1) * inverse
 
     def plane_gradient(corner_values):
         first = corner_values[:, 1] - corner_values[:, 0]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool as NpBool
 from jaxtyping import Int as NpInt
 
-from jaxface._numerics import safe_normalize
+from jaxface._numerics import cross, safe_normalize
 from jaxface._types import Array, Float, Int
 
 
@@ -19,7 +19,7 @@ def face_areas_normals(
 ) -> Float[Array, "f 3"]:
     """Area-weighted normals: outward for counter-clockwise corners, as long as twice the area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return jnp.cross(b - a, c - a)
+    return cross(b - a, c - a)
 
 
 def face_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "f 3"]:

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxface._numerics import cross
 from jaxface._types import Array, Float, Int
 
 
@@ -95,14 +96,14 @@ def normal_derivative(
         own = own - arm
         # Each face is met by two of the vertex's edges, and sum_j (v_j - v_i) x c_ij counts it
         # twice: it is the derivative of a quadratic form along itself.
-        area_normal = area_normal + 0.5 * jnp.cross(vertices[neighbor] - vertices, arm)
+        area_normal = area_normal + 0.5 * cross(vertices[neighbor] - vertices, arm)
         change = change + _cross_modes(basis[neighbor], arm)
     if stencil.extra.shape[0]:
         vertex, neighbor, ahead, behind = stencil.extra.T
         arm = vertices[ahead] - vertices[behind]
         own = own.at[vertex].add(-arm)
         area_normal = area_normal.at[vertex].add(
-            0.5 * jnp.cross(vertices[neighbor] - vertices[vertex], arm)
+            0.5 * cross(vertices[neighbor] - vertices[vertex], arm)
         )
         change = change.at[vertex].add(_cross_modes(basis[neighbor], arm))
     change = change + _cross_modes(basis, own)

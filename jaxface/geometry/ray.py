@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from jaxface._numerics import cross
 from jaxface._types import Array, Float
 
 
@@ -26,10 +27,10 @@ def ray_weights(
     a = corners[..., 0, :]
     edge1 = corners[..., 1, :] - a
     edge2 = corners[..., 2, :] - a
-    p = jnp.cross(direction, edge2)
+    p = cross(direction, edge2)
     determinant = jnp.sum(edge1 * p, axis=-1)
     flat = determinant == 0
     inverse = jnp.where(flat, 0.0, 1.0 / jnp.where(flat, 1.0, determinant))
     w1 = -jnp.sum(a * p, axis=-1) * inverse
-    w2 = -jnp.sum(direction * jnp.cross(a, edge1), axis=-1) * inverse
+    w2 = -jnp.sum(direction * cross(a, edge1), axis=-1) * inverse
     return jnp.stack([1.0 - w1 - w2, w1, w2], axis=-1)

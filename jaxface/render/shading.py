@@ -14,7 +14,9 @@ Light is given in the camera's frame (x right, y up, z towards the camera).
 
 import math
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Float
 
@@ -26,6 +28,24 @@ Y22 = math.sqrt(15 / (16 * math.pi))
 
 BAND = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 """band l of each of the nine functions"""
+
+
+def _quadratic_forms() -> Float[np.ndarray, "9 4 4"]:
+    """Symmetric ``Q_k`` with ``H_k(n) = (n, 1)^T Q_k (n, 1)``."""
+    terms: tuple[dict[str, float], ...] = (
+        {"11": Y0}, {"y1": Y1}, {"z1": Y1}, {"x1": Y1}, {"xy": Y2}, {"yz": Y2},
+        {"zz": 3 * Y20, "11": -Y20}, {"xz": Y2}, {"xx": Y22, "yy": -Y22},
+    )  # fmt: skip
+    forms = np.zeros((9, 4, 4))
+    for form, products in zip(forms, terms, strict=True):
+        for product, factor in products.items():
+            i, j = ("xyz1".index(letter) for letter in product)
+            form[i, j] += factor / 2
+            form[j, i] += factor / 2
+    return forms
+
+
+_FORMS = _quadratic_forms()
 
 
 def sh_basis(normals: Float[Array, "*batch 3"]) -> Float[Array, "*batch 9"]:
@@ -47,6 +67,7 @@ def sh_basis(normals: Float[Array, "*batch 3"]) -> Float[Array, "*batch 9"]:
     )
 
 
+@jax.custom_jvp
 def irradiance(
     normals: Float[Array, "*batch 3"], light: Float[Array, "9 3"]
 ) -> Float[Array, "*batch 3"]:
@@ -56,6 +77,33 @@ def irradiance(
     ``light_from_radiance``. The value may be negative where the second order rings.
     """
     return sh_basis(normals) @ light
+
+
+@irradiance.defjvp
+def _irradiance_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    # As one form of the light, since the columns of `sh_basis` would each be differentiated, and
+    # compiled, on their own.
+    (normals, light), (turned, changed) = primals, tangents
+    basis = sh_basis(normals)
+    slope = irradiance_slope(normals, light)
+    change = jnp.einsum("...cx,...x->...c", slope, turned, precision="highest")
+    return basis @ light, change + basis @ changed
+
+
+def irradiance_slope(
+    normals: Float[Array, "*batch 3"], light: Float[Array, "9 3"]
+) -> Float[Array, "*batch 3 3"]:
+    """Derivative of ``irradiance`` (colour, last but one axis) along x, y and z (last axis).
+
+    Twice ``M_c (n, 1)``, since irradiance is the quadratic form ``(n, 1)^T M_c (n, 1)`` of each
+    colour (Ramamoorthi & Hanrahan 2001, equations 11 and 12).
+    """
+    forms = jnp.asarray(_FORMS, light.dtype)
+    matrices = 2.0 * jnp.einsum("kc,kij->cij", light, forms, precision="highest")
+    turned = jnp.einsum("...i,cij->...cj", normals, matrices[:, :3, :3], precision="highest")
+    return turned + matrices[:, 3, :3]
 
 
 def light_from_radiance(radiance: Float[Array, "9 3"]) -> Float[Array, "9 3"]:

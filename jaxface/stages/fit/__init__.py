@@ -2,6 +2,7 @@
 
 from jaxface.stages.fit.batch import fit_batch
 from jaxface.stages.fit.cast_shadows import cast_shadows
+from jaxface.stages.fit.levels import fit_parameters, follows_shadows, through_levels
 from jaxface.stages.fit.photo import WorkingPhoto, working_photo
 from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
@@ -17,11 +18,8 @@ from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_f
 from jaxface.stages.fit.solve import (
     fit_energy,
     fit_level,
-    fit_parameters,
     fit_shadows,
     fit_start,
-    follows_shadows,
-    through_levels,
 )
 
 __all__ = [

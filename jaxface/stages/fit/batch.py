@@ -9,9 +9,9 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxface.models.parameters import FaceParameters
+from jaxface.stages.fit.levels import fit_parameters
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitInput, FitStats, FitWeights
-from jaxface.stages.fit.solve import fit_parameters
 
 
 @jax.jit
