@@ -67,6 +67,11 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
     three = {"layers": STYLE_LAYERS[:3]}
     for name in networks:
         yield Variant("features", name, features=name)
+    for name in ("random", "trained"):
+        for count in (2, 3):
+            given = {"layers": STYLE_LAYERS[:count], "match_octaves": True}
+            yield Variant("octaves", f"{name}, {count} layers", given, features=name)
+    yield Variant("octaves", "trained", {"match_octaves": True}, features="trained")
     if vgg is not None:
         yield Variant("features", "VGG-19, 3 layers", three, features=str(vgg))
         yield Variant("features", "random, 3 layers", three)
