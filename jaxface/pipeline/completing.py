@@ -255,11 +255,16 @@ class _Work:
         seen = self.maps(level)
         return with_photo(texture, seen.photo, seen.weight, PHOTO_BLUR * self._texels(level))
 
+    def detail(self, level: int) -> Float[Array, "r r"]:
+        """How much detail is let in at each texel, 0 to 1."""
+        asked = self.seen.detail_map(self.settings.detail)
+        return jnp.asarray(shrink(asked[..., None], level)[..., 0])
+
     def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
         """The texture before synthesis: whole, sRGB-encoded."""
         low = texture = self.maps(level).low_frequency
         if self.settings.start == "neighbour":
-            texture = self.subject(nearest, level)
+            texture = low + self.detail(level)[..., None] * (self.subject(nearest, level) - low)
         texture = self.with_photo(texture, level)
         skin = shrink(self.seen.skin[..., None].astype(np.float32), level)
         return np.asarray(skin * texture + (1 - skin) * low)
@@ -280,12 +285,11 @@ class _Work:
             first = first + resize(jnp.asarray(coarser)[..., None] - lower, *first.shape)[..., 0]
         seen = self.maps(level)
         free = self.cut(seen.mask, level)
-        detail = shrink(self.seen.detail_map(self.settings.detail)[..., None], level)[..., 0]
         known = KnownDetail(
             self.cut(rgb_to_yiq(seen.photo)[..., 0], level),
             self.cut(seen.weight, level) * free,
             self.cut(rgb_to_yiq(seen.low_frequency)[..., 0], level),
-            jnp.asarray(self.cut(detail, level)),
+            self.cut(self.detail(level), level),
         )
         goal = self.targets(level, blended, used)
         targets = StyleTargets(goal, alpha=self.settings.alpha)

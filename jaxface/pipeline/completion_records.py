@@ -34,7 +34,7 @@ class CompletionSettings:
     match_complexion: bool = True
     """compare and blend the subjects' detail on the photo's complexion; False: as in the paper,
     where tone counts too"""
-    match_octaves: bool = False
+    match_octaves: bool = True
     """whether subjects whose complexion is matched get each octave of detail as strong as the
     photo's"""
     carry: float | None = 1.0

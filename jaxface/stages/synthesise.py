@@ -121,10 +121,10 @@ def synthesise(
 
     def of_change(change: Array, args: tuple[Array, SynthesisProblem]) -> Array:
         start, problem = args
-        return energy.value(changed(start, change), problem)[0]
+        return energy.value(changed(start, change, problem.known.detail), problem)[0]
 
     def within(change: Array) -> Array:
-        return jnp.where(problem.free, changed(start, change), start)
+        return jnp.where(problem.free, changed(start, change, problem.known.detail), start)
 
     def watch(step: int, state: LBFGSState) -> bool | None:
         def image() -> Array:
@@ -150,12 +150,18 @@ def synthesise(
     )
 
 
-def changed(start: Float[Array, "h w"], change: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Intensities in (0, 1): ``(1 + tanh(artanh(2 start - 1) + B change)) / 2``.
+def changed(
+    start: Float[Array, "h w"],
+    change: Float[Array, "h w"],
+    detail: Float[Array, "h w"] | float = 1.0,
+) -> Float[Array, "h w"]:
+    """Intensities in (0, 1): ``(1 + tanh(artanh(2 start - 1) + detail * B change)) / 2``.
 
-    ``B`` scales frequencies by their inverse (``imaging.spectrum``): a preconditioner. The energy
-    is far less curved along low frequencies, of which a Gramian sees the little that leaves the
-    receptive field, than along high ones; with it a third of the evaluations reach the same energy.
+    Where the detail map is 0 the start stays as it is. ``B`` scales frequencies by their inverse
+    (``imaging.spectrum``): a preconditioner. The energy is far less curved along low frequencies,
+    of which a Gramian sees the little that leaves the receptive field, than along high ones; with
+    it half of the evaluations and fewer reach the same energy. Below its offset ``B`` is level,
+    so that the complexion, which the low-frequency albedo gives, is not what moves first.
     """
     first = jnp.arctanh(2 * jnp.clip(start, 0.004, 0.996) - 1)
-    return 0.5 + 0.5 * jnp.tanh(first + inverse_frequency(change))
+    return 0.5 + 0.5 * jnp.tanh(first + detail * inverse_frequency(change))
