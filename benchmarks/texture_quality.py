@@ -25,7 +25,7 @@ from texture_metrics import distances, inner_grams, measuring_networks
 from texture_quality_table import write_results
 
 from jaxface.imaging.colour import rgb_to_yiq
-from jaxface.io.feature_weights import TRAINED, load_network
+from jaxface.io.feature_weights import load_network
 from jaxface.models.features import STYLE_LAYERS
 from jaxface.pipeline.completing import Completed, CompletionSettings, complete
 from jaxface.pipeline.skin_database import synth_database
@@ -62,19 +62,18 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
         yield Variant("core", f"completed, {case}", case=case)
     for name, carry in (("None (the paper's)", None), ("0", 0.0), ("0.5", 0.5)):
         yield Variant("carry", name, {"carry": carry})
-    yield Variant("octaves", "as the photo's", {"match_octaves": True})
-    networks = ["random-vgg19", *(["trained"] if TRAINED.is_file() else [])]
-    three = {"layers": STYLE_LAYERS[:3]}
-    for name in networks:
-        yield Variant("features", name, features=name)
-    for name in ("random", "trained"):
-        for count in (2, 3):
-            given = {"layers": STYLE_LAYERS[:count], "match_octaves": True}
-            yield Variant("octaves", f"{name}, {count} layers", given, features=name)
-    yield Variant("octaves", "trained", {"match_octaves": True}, features="trained")
+    for case in ("left", "oval"):
+        yield Variant("octaves", f"as they are, {case}", {"match_octaves": False}, case=case)
+    networks = {"random-vgg19": "random-vgg19", "trained": "trained"}
     if vgg is not None:
-        yield Variant("features", "VGG-19, 3 layers", three, features=str(vgg))
-        yield Variant("features", "random, 3 layers", three)
+        networks["VGG-19"] = str(vgg)
+    for case in ("left", "oval"):
+        for label, source in networks.items():
+            layers = STYLE_LAYERS[: 3 if label == "VGG-19" else 5]
+            yield Variant("features", f"{label}, {len(layers)} layers, {case}",
+                          {"layers": layers}, features=source, case=case)  # fmt: skip
+        yield Variant("features", f"random, 3 layers, {case}", {"layers": STYLE_LAYERS[:3]},
+                      case=case)  # fmt: skip
     for photo in (0.0, 300.0):
         weights = SynthesisWeights(photo=photo)
         yield Variant("kept photo", f"{photo:g}", {"weights": weights})
