@@ -52,10 +52,9 @@ def normal_stencil(faces: np.ndarray, vertex_count: int, width: int = 7) -> Norm
     inside = slot < width
     table = np.repeat(np.arange(vertex_count)[:, None, None], width, axis=1).repeat(3, axis=2)
     table[merged[inside, 0], slot[inside]] = merged[inside, 1:]
-    as_int = jnp.asarray(table, jnp.int32)
-    return NormalStencil(
-        as_int[..., 0], as_int[..., 1], as_int[..., 2], jnp.asarray(merged[~inside], jnp.int32)
-    )
+    neighbor, ahead, behind = (jnp.asarray(table[..., k].astype(np.int32)) for k in range(3))
+    extra = jnp.asarray(merged[~inside].astype(np.int32))
+    return NormalStencil(neighbor, ahead, behind, extra)
 
 
 def _merge_pairs(edges: np.ndarray) -> np.ndarray:

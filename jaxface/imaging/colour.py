@@ -1,5 +1,6 @@
 """Colour: the sRGB transfer curve, luminance, and the YIQ space of Saito 2017 (section 4)."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,6 +21,7 @@ RGB_TO_YIQ = np.array(
 YIQ_TO_RGB = np.linalg.inv(RGB_TO_YIQ)
 
 
+@jax.jit
 def srgb_to_linear(encoded: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Decode sRGB values to linear light (IEC 61966-2-1, exact pieces, odd below zero).
 
@@ -31,6 +33,7 @@ def srgb_to_linear(encoded: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.where(dark, encoded / 12.92, jnp.sign(encoded) * curve)
 
 
+@jax.jit
 def linear_to_srgb(linear: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Encode linear light as sRGB (IEC 61966-2-1, exact pieces, odd below zero).
 

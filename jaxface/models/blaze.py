@@ -127,7 +127,7 @@ def read_chain(
         index = len(layers)
         here = f"{prefix}/{index}/"
         weights = {
-            name.removeprefix(here): jnp.asarray(array, jnp.float32)
+            name.removeprefix(here): jnp.asarray(np.asarray(array, np.float32))
             for name, array in arrays.items()
             if name.startswith(here)
         }

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Float, Int
 from jaxface.models.linear import LinearBasis
@@ -77,5 +78,6 @@ class MorphableModel(eqx.Module):
             raise ValueError(
                 f"model {self.name!r} has no region {unknown}; it has {list(self.region_names)}"
             )
-        wanted = jnp.array([self.region_names.index(name) for name in names])
-        return jnp.any(self.region[:, None] == wanted, axis=1)
+        # The last entry is for vertices of no region, -1.
+        wanted = np.array([*(name in names for name in self.region_names), False])
+        return jnp.asarray(wanted)[self.region]

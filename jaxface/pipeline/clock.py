@@ -83,19 +83,3 @@ class KeptProgram(NamedTuple):
     def __hash__(self) -> int:
         """By name and function: options are a dict."""
         return hash((self.name, self.function))
-
-
-def quick_compilation() -> dict[str, Any]:
-    """Compiler options that make the fit compile faster at the same speed of the program.
-
-    XLA's newer loop emitters for CPUs take half as long again to compile the fit (49 against 40 s
-    of processor time) and gain nothing there. Empty where the option does not exist.
-    """
-    options = {"xla_cpu_use_fusion_emitters": False}
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=options).lower(0.0).compile()
-    except Exception:  # an unknown option raises a different error in every release
-        return {}
-    return options

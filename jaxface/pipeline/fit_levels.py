@@ -6,8 +6,9 @@ from typing import Any
 
 import jax
 
+from jaxface._compilation import quick_compilation
 from jaxface.models.parameters import FaceParameters, neutral_parameters
-from jaxface.pipeline.clock import Clock, KeptProgram, quick_compilation
+from jaxface.pipeline.clock import Clock, KeptProgram
 from jaxface.pipeline.programs import keep_structure
 from jaxface.stages.fit import (
     FitConfig,

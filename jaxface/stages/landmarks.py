@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxface._compilation import quick_jit
 from jaxface._types import Array, Float, Shaped
 from jaxface.imaging.pyramid import halve
 from jaxface.imaging.resample import affine_crop
@@ -267,19 +268,19 @@ def _channels_last(patch: Float[np.ndarray, "3 p p"]) -> Float[Array, "p p 3"]:
     return jnp.moveaxis(patch, 0, -1)
 
 
-@jax.jit
+@quick_jit
 def _detect(detector: FaceDetector, picture: Float[np.ndarray, "128 128 3"]) -> Candidates:
     return detector(picture)
 
 
-@jax.jit
+@quick_jit
 def _level_picture(image: Float[Array, "p p 3"], region: Region) -> Array:
     wider = Region(region.centre, region.side * _LEVEL_MARGIN, region.angle)
     size = 2 * DETECTOR_SIZE
     return halve(affine_crop(image, wider.transform(size), size, size))
 
 
-@jax.jit
+@quick_jit
 def _look(
     mesh: LandmarkNet, image: Float[Array, "p p 3"], region: Region
 ) -> tuple[Float[Array, "468 3"], Float[Array, ""], Region]:

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,6 +34,9 @@ def landmark_weights(count: int) -> Float[np.ndarray, "l"]:
     weights[features] = 1.0
     weights[MEDIAPIPE_TO_IBUG68[INNER_68].reshape(-1)] = 1.0
     return weights
+
+
+_oval_mask = jax.jit(face_oval_mask, static_argnums=(1, 2))
 
 
 class WorkingPhoto(NamedTuple):
@@ -80,7 +84,7 @@ def working_photo(
     crop = crop_face(photo, points, size)
     inside = crop.to_crop(points)
     if mask is None:
-        valid = np.asarray(face_oval_mask(jnp.asarray(inside * size, jnp.float32), size, size))
+        valid = np.asarray(_oval_mask(jnp.asarray(inside * size, jnp.float32), size, size))
     else:
         if mask.shape != (height, width):
             raise ValueError(f"the mask is {mask.shape}, but the photo is {(height, width)}")
