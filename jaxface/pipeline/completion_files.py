@@ -72,6 +72,8 @@ def complete_folder(
     started = time.perf_counter()
     network = load_network(features)
     seen = read_seen_texture(place, resolution, model)
+    # Complete, if smooth: a first look while the database is painted and compared.
+    write_png(place / "albedo_preview.png", seen.low_frequency)
     textures = open_database(database, model or seen.model.name, seen.resolution, on_step)
     work = _Checkpoint(place, settings, network.name, textures, seen)
     shown = -PREVIEW_SECONDS  # the first picture is shown at once

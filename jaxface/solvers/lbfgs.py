@@ -71,7 +71,7 @@ def lbfgs_step(
     start, slope = float(state.value), float(slope)
     evaluations = state.evaluations
     for _ in range(trials if slope < 0 else 0):
-        y = state.y + jnp.asarray(length, state.y.dtype) * direction
+        y = _along(state.y, direction, length)
         value, gradient = value_and_grad(y, args)
         evaluations += 1
         reached = float(value)
@@ -112,11 +112,27 @@ def _direction(gradient: Array, steps: Array, changes: Array, pairs: Array) -> t
     return -r, -(r @ gradient)
 
 
+@jax.jit
+def _along(y: Array, direction: Array, length: float) -> Array:
+    return y + jnp.asarray(length, y.dtype) * direction
+
+
 def _remember(state: LBFGSState, y: Array, gradient: Array) -> tuple[Array, Array, int]:
-    step, change = y - state.y, gradient - state.gradient
-    enough = 1e-7 * jnp.linalg.norm(step) * jnp.linalg.norm(change)
-    if not float(step @ change) > float(enough):
+    steps, changes, curved = _newer(
+        state.steps, state.changes, y, state.y, gradient, state.gradient
+    )
+    if not bool(curved):
         return state.steps, state.changes, state.pairs
-    steps = jnp.concatenate([state.steps[1:], step[None]])
-    changes = jnp.concatenate([state.changes[1:], change[None]])
     return steps, changes, min(state.pairs + 1, len(steps))
+
+
+@jax.jit
+def _newer(
+    steps: Array, changes: Array, y: Array, last: Array, gradient: Array, last_gradient: Array
+) -> tuple[Array, Array, Array]:
+    """The memory with a new pair, and whether that shows positive curvature."""
+    step, change = y - last, gradient - last_gradient
+    enough = 1e-7 * jnp.linalg.norm(step) * jnp.linalg.norm(change)
+    steps = jnp.concatenate([steps[1:], step[None]])
+    changes = jnp.concatenate([changes[1:], change[None]])
+    return steps, changes, step @ change > enough
