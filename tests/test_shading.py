@@ -3,11 +3,18 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.test_util import check_grads
 
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.render.image import render
-from jaxface.render.shading import ambient_light, irradiance, light_from_radiance, sh_basis
+from jaxface.render.shading import (
+    ambient_light,
+    irradiance,
+    irradiance_slope,
+    light_from_radiance,
+    sh_basis,
+)
 
 
 def quadrature(bands=16):
@@ -104,3 +111,22 @@ def test_background_shows_where_the_mesh_does_not():
     np.testing.assert_array_equal(image.color[~image.mask], photo[~image.mask])
     np.testing.assert_allclose(image.color[image.mask], 1.0, rtol=1e-5)
     assert float(jnp.abs(image.normals[~image.mask]).max()) == 0
+
+
+def test_irradiance_and_its_rule_are_those_of_the_basis(x64):
+    rng = np.random.default_rng(4)
+    normals, light = jnp.asarray(rng.normal(size=(5, 3))), jnp.asarray(rng.normal(size=(9, 3)))
+
+    def plain(normals, light):
+        return sh_basis(normals) @ light
+
+    slope = jax.vmap(jax.jacfwd(plain), (0, None))(normals, light)
+    np.testing.assert_allclose(irradiance_slope(normals, light), slope, atol=1e-12)
+    probe = jnp.asarray(rng.normal(size=(5, 3)))
+    ours, theirs = (
+        jax.grad(lambda n, c, f=f: jnp.sum(probe * f(n, c)), (0, 1))(normals, light)
+        for f in (irradiance, plain)
+    )
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+    check_grads(irradiance, (normals, light), 2, ("fwd", "rev"), eps=1e-5)
