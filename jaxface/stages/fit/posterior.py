@@ -28,6 +28,12 @@ def posterior(
     has no outside of its own span, so the deviations say what the photo leaves open *within* the
     model.
 
+    Measured on 15 renders of faces of the bundled model (three subjects, coloured light, yaw 0 to
+    40 degrees): the face's vertices are off by 0.84 mm rms after the best similarity transform,
+    where the deviations say 0.82; 75 % lie within one deviation and 97 % within two. Without the
+    transform, that is with the head's size, they are off by 1.4 mm, and the identity coefficients
+    by 1.34 of their deviations: a little too sure.
+
     Args:
         curvature: of the weighted energy at the fit, ``FitStats.curvature``.
         model: the level of detail whose vertices are asked for.
