@@ -148,11 +148,10 @@ class _Work:
         self._box = low, high.clip(max=seen.resolution)
         sharp = [r for r in self.levels if r <= ANALYSIS and self._texels(r) <= 1.5]
         self.analysis_level = max(sharp, default=self.levels[0])
-        tiled = np.prod(self._box[1] - self._box[0]) > LARGEST_WHOLE
-        height, width = (int(n) for n in self._box[1] - self._box[0])
-        tile = even_tile((height, width)) if tiled else None
-        self._grams = jax.jit(lambda net, image: grams(net, image, settings.layers, tile))
-        self.tile = tile
+        self._grams = jax.jit(
+            lambda net, image, tile: grams(net, image, settings.layers, tile),
+            static_argnums=2,
+        )
         # One level's alone: whole maps of every level would add up.
         self.maps = functools.lru_cache(maxsize=1)(self._maps)
 
@@ -164,6 +163,11 @@ class _Work:
         factor = self.seen.resolution // level
         (top, left), (bottom, right) = (corner // factor for corner in self._box)
         return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+    def tile(self, level: int) -> int | None:
+        """Side of the tiles in which a level's statistics are summed; None for the whole box."""
+        height, width = (part.stop - part.start for part in self.box(level))
+        return even_tile((height, width)) if height * width > LARGEST_WHOLE else None
 
     def cut(self, texture: Any, level: int) -> Any:
         return texture[self.box(level)]
@@ -201,7 +205,7 @@ class _Work:
     def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
         """Gram matrices of a texture's intensity, masked out beyond a mask, in the box."""
         shown = mask_out(rgb_to_yiq(texture)[..., 0], jnp.asarray(mask))
-        return self._grams(self.network, self.cut(shown, level))
+        return self._grams(self.network, self.cut(shown, level), self.tile(level))
 
     def blend(self) -> Blend:
         """Section 4: compare what the photo shows with the same part of every subject."""
@@ -304,7 +308,11 @@ class _Work:
             self.on_progress(what, step, steps, lambda: self.compose(start, np.asarray(image())))
 
         found = synthesise(
-            jnp.clip(first, 0.01, 0.99), problem, steps=steps, tile=self.tile, on_step=on_step
+            jnp.clip(first, 0.01, 0.99),
+            problem,
+            steps=steps,
+            tile=self.tile(level),
+            on_step=on_step,
         )
         record = {
             "name": f"{level} px",
