@@ -6,7 +6,7 @@ import numpy as np
 from jaxface._types import Array, Float
 
 
-def inverse_frequency(image: Float[Array, "h w"], offset: float = 20.0) -> Float[Array, "h w"]:
+def inverse_frequency(image: Float[Array, "h w"], offset: float = 8.0) -> Float[Array, "h w"]:
     """Each spatial frequency f scaled by ``1 / (f + f_0)``, periodically beyond the borders.
 
     White noise keeps its variance. Linear and symmetric.
