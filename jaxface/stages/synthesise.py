@@ -160,7 +160,7 @@ def changed(
     Where the detail map is 0 the start stays as it is. ``B`` scales frequencies by their inverse
     (``imaging.spectrum``): a preconditioner. The energy is far less curved along low frequencies,
     of which a Gramian sees the little that leaves the receptive field, than along high ones; with
-    it half of the evaluations and fewer reach the same energy. Below its offset ``B`` is level,
+    it half of the evaluations, and fewer, reach the same energy. Below its offset ``B`` is level,
     so that the complexion, which the low-frequency albedo gives, is not what moves first.
     """
     first = jnp.arctanh(2 * jnp.clip(start, 0.004, 0.996) - 1)
