@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 
-def quick_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """``jax.jit`` with ``quick_compilation``, for programs that are called from the host.
 
     The back end is asked for its options at the first call, not where the program is defined.
@@ -15,7 +15,7 @@ def quick_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
     @functools.cache
     def program() -> Callable[..., Any]:
-        return jax.jit(function, compiler_options=quick_compilation(), **options)
+        return jax.jit(function, compiler_options=quick_compilation())
 
     @functools.wraps(function)
     def call(*args: Any, **given: Any) -> Any:

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from jaxface._types import Array, Float, Shaped
+from jaxface._types import Array, Float, Int, Shaped
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
@@ -29,7 +29,7 @@ def _safe_norm_jvp(
 ) -> tuple[Array, Array]:
     (x,), (moved,) = primals, tangents
     norm = safe_norm(x, axis, True)
-    slope = x * jnp.where(norm > 0, 1.0 / jnp.where(norm > 0, norm, 1.0), 0.0)
+    slope = safe_divide(x, norm)
     change = jnp.sum(slope * moved, axis=axis, keepdims=True)
     return (norm, change) if keepdims else (jnp.squeeze(norm, axis), jnp.squeeze(change, axis))
 
@@ -58,6 +58,28 @@ def safe_sqrt(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Square root of ``max(x, 0)``; the derivative is zero for ``x <= 0``."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def running_count(flags: Shaped[Array, "*batch t"]) -> Int[Array, "*batch t"]:
+    """How many flags (zeros and ones) are set up to and with each, along the last axis.
+
+    Prefix sums of blocks of 128, of the blocks' sums, and so on, by a triangular matrix: XLA's own
+    prefix sum is ten times slower on a CPU. Exact up to 2^24 flags, the integers of float32.
+    """
+
+    def summed(values: Array) -> Array:
+        size = values.shape[-1]
+        edges = [(0, 0)] * (values.ndim - 1)
+        blocks = jnp.pad(values, [*edges, (0, -size % 128)])
+        blocks = blocks.reshape(*values.shape[:-1], -1, 128)
+        upper = jnp.triu(jnp.ones((128, 128), jnp.float32))
+        within = jnp.matmul(blocks, upper, precision=jax.lax.Precision.HIGHEST)
+        if within.shape[-2] > 1:
+            sums = within[..., -1]
+            within = within + (summed(sums) - sums)[..., None]
+        return within.reshape(*values.shape[:-1], -1)[..., :size]
+
+    return summed(flags.astype(jnp.float32)).astype(jnp.int32)
 
 
 def all_finite(tree: Shaped[Array, "..."]) -> Array:

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,14 +139,22 @@ def test_exposure_does_not_matter(model, known):
 
 
 @pytest.mark.slow
-def test_batch_equals_one_by_one(known, fitted):
-    working, models, config, y, _ = fitted
-    mirrored = working.data
-    answer, stats = fit_batch([working.data, mirrored], models, FitWeights(), config)
-    assert answer.identity.shape[0] == 2
-    np.testing.assert_allclose(answer.identity[0], answer.identity[1], atol=1e-3)
-    np.testing.assert_allclose(answer.identity[0], y.identity, atol=0.15)
+def test_batch_equals_one_by_one(fitted, x64):
+    """In double precision, where rounding cannot decide which pixels at the rim take part."""
+    working, models, config, *_ = fitted
+    data, models = jax.tree.map(_wide, (working.data, models))
+    darker = dataclasses.replace(data, image=data.image * jnp.linspace(0.8, 1.0, SIZE)[:, None])
+    answer, stats = fit_batch([data, darker], models, FitWeights(), config)
     assert stats.curvature.shape[0] == 2
+    one_by_one = jax.jit(fit_parameters)
+    for k, single in enumerate((data, darker)):
+        y, _ = one_by_one(single, models, FitWeights(), config)
+        for found, expected in zip(jax.tree.leaves(answer), jax.tree.leaves(y), strict=True):
+            np.testing.assert_allclose(found[k], expected, rtol=1e-8, atol=1e-8)
+
+
+def _wide(x):
+    return x.astype(np.float64) if x.dtype == np.float32 else x
 
 
 @pytest.mark.slow

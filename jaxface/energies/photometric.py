@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import running_count, safe_norm
 from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.ray import pixel_rays, ray_weights
@@ -49,26 +49,29 @@ def sample_pixels(
     face_mask: Bool[Array, "f"],
     principal: Float[Array, "2"],
     capacity: int,
+    side: float | Float[Array, ""] | None = None,
 ) -> PixelSamples:
     """Gather the pixels that show an allowed triangle, at most ``capacity`` of them.
 
     If more are visible, an evenly spread subset (in scan order) stands for all.
 
     Args:
-        image: square working image, linear RGB.
+        image: square working image, linear RGB, or a larger canvas with it in its first corner.
         mask: weight of each pixel in [0, 1].
         triangle: visible triangle of each pixel, -1 for the background.
         faces: the mesh.
         face_mask: triangles that take part.
         principal: principal point of the camera, as fractions of the side.
         capacity: length of the lists.
+        side: of the working image, px; the image's by default.
     """
     height, width = triangle.shape
+    side = width if side is None else side
     flat = triangle.reshape(-1)
     weight = mask.reshape(-1) * ((flat >= 0) & face_mask[flat])
     y, x = jnp.divmod(jnp.arange(height * width), width)
     everywhere = PixelSamples(
-        position=((jnp.stack([x, y], axis=-1) + 0.5) / width).astype(image.dtype),
+        position=((jnp.stack([x, y], axis=-1) + 0.5) / side).astype(image.dtype),
         triangle=faces[jnp.maximum(flat, 0)],
         color=image.reshape(-1, 3),
         weight=weight.astype(image.dtype),
@@ -85,7 +88,7 @@ def thin_samples(samples: PixelSamples, capacity: int) -> PixelSamples:
     """
     capacity = min(capacity, samples.weight.shape[0])
     valid = samples.weight > 0
-    rank = jnp.cumsum(valid) - 1
+    rank = running_count(valid) - 1
     count = rank[-1] + 1
     slot = jnp.where(count > capacity, (rank * (capacity / count)).astype(jnp.int32), rank)
     slot = jnp.where(valid, slot, capacity)

@@ -1,5 +1,7 @@
 """Rotations: axis-angle parameters, matrices, and the closed-form alignment of point sets."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.tensordot(jnp.asarray(_SKEW, v.dtype), v, 1, precision="highest")
 
 
+@functools.partial(jax.jit, inline=True)
 def rotation_matrix(axis_angle: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Rodrigues' formula ``R = I + a [w]x + b [w]x^2`` for the rotation vector ``w`` (radians).
 
@@ -86,6 +89,7 @@ def similarity_transform(
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
+@functools.partial(jax.jit, inline=True)
 def euler_yxz(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """(yaw, pitch, roll) in radians with ``R = Ry(yaw) Rx(pitch) Rz(roll)``.
 

@@ -127,11 +127,12 @@ def read_chain(
         index = len(layers)
         here = f"{prefix}/{index}/"
         weights = {
-            name.removeprefix(here): jnp.asarray(np.asarray(array, np.float32))
+            name.removeprefix(here): jax.device_put(np.asarray(array, np.float32))
             for name, array in arrays.items()
             if name.startswith(here)
         }
-        weights.setdefault("slope", jnp.full(1, 1.0 if index in linear else 0.0))
+        slope = np.full(1, 1.0 if index in linear else 0.0, np.float32)
+        weights.setdefault("slope", jax.device_put(slope))
         layer = ResidualBlock if "depthwise" in weights else Convolution
         layers.append(layer(**weights, stride=2 if index in halving else 1))
     if not layers:

@@ -5,6 +5,9 @@ dlib) start at the subject's right ear: 0-16 jaw, 17-26 brows, 27-35 nose, 36-47
 Right and left are the subject's.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -88,6 +91,7 @@ MEDIAPIPE_TO_IBUG68_WEIGHTS = np.array([(share, 1 - share) for _, _, share in _P
 """(68, 2) the weight of each of the two"""
 
 
+@functools.partial(jax.jit, inline=True)
 def landmarks68(points: Float[Array | np.ndarray, "468 d"]) -> Float[Array, "68 d"]:
     """The 68 iBUG points of a face mesh: fixed blends of two mesh points each.
 

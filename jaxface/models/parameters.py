@@ -29,7 +29,7 @@ class FaceParameters(eqx.Module):
         """The rigid motion from the model's frame to the camera's."""
         return Pose(self.rotation, self.translation)
 
-    def camera(self, principal: Float[Array, "2"], size: float = 1.0) -> Camera:
+    def camera(self, principal: Float[Array, "2"], size: float | Float[Array, ""] = 1.0) -> Camera:
         """The camera of a square working image.
 
         Args:

@@ -1,8 +1,11 @@
 """Times of a run, with compilation apart."""
 
+import functools
+import os
+import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -34,15 +37,23 @@ class Clock:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - ready
         return answer
 
-    def prepare(self, name: str, calls: Sequence[tuple[Any, tuple[PyTree, ...]]]) -> None:
-        """Compile programs side by side; arguments may be ``jax.ShapeDtypeStruct``s.
+    def begin(self, calls: Sequence[tuple[Any, tuple[PyTree, ...]]]) -> Callable[[], None]:
+        """Compile programs side by side in the background, for ``run`` to find them.
 
-        XLA compiles one program on one core, and without holding Python's lock.
+        XLA compiles one program on one core, and without holding Python's lock. What ``run`` has
+        to wait for them counts as compilation.
+
+        Args:
+            calls: programs and their arguments, which may be ``jax.ShapeDtypeStruct``s.
+
+        Returns:
+            What drops those that are not begun yet.
         """
-        start = time.perf_counter()
-        with ThreadPoolExecutor() as pool:
-            list(pool.map(lambda call: _compiled(call[0], *call[1]), calls))
-        self.compiling[name] = self.compiling.get(name, 0.0) + time.perf_counter() - start
+        pool = ThreadPoolExecutor(os.cpu_count())
+        for program, args in calls:
+            pool.submit(_compiled, program, *args)
+        pool.shutdown(wait=False)
+        return functools.partial(pool.shutdown, wait=False, cancel_futures=True)
 
     def host(self, name: str, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Call a function of the host and time it."""
@@ -52,25 +63,39 @@ class Clock:
         return answer
 
 
-_PROGRAMS: dict[Any, Any] = {}
+_PROGRAMS: dict[Any, Future[Any]] = {}
+_LOCK = threading.Lock()
 
 
 def _compiled(program: Any, *args: PyTree) -> Any:
-    """The compiled program for arguments of these shapes, made once a process."""
+    """The compiled program for arguments of these shapes, made once a process, by any thread."""
     leaves, structure = jax.tree.flatten(args)
     shapes = tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
     key = (program, structure, shapes)
-    if key not in _PROGRAMS:
-        if isinstance(program, KeptProgram):
-            flat = jax.jit(
-                kept_program(program.name, program.function, *args),
-                compiler_options=program.compiler_options,
-            )
-            compiled = flat.lower(*leaves).compile()
-            _PROGRAMS[key] = lambda *args: compiled(*jax.tree.leaves(args))
-        else:
-            _PROGRAMS[key] = program.lower(*args).compile()
-    return _PROGRAMS[key]
+    with _LOCK:
+        found = _PROGRAMS.get(key)
+        if found is None:
+            ours = _PROGRAMS[key] = Future()
+    if found is not None:
+        return found.result()
+    try:
+        ours.set_result(_compile(program, *args))
+    except BaseException as error:
+        # Whoever waits for it hears of it; the next caller tries again.
+        del _PROGRAMS[key]
+        ours.set_exception(error)
+    return ours.result()
+
+
+def _compile(program: Any, *args: PyTree) -> Any:
+    if not isinstance(program, KeptProgram):
+        return program.lower(*args).compile()
+    flat = jax.jit(
+        kept_program(program.name, program.function, *args),
+        compiler_options=program.compiler_options,
+    )
+    compiled = flat.lower(*jax.tree.leaves(args)).compile()
+    return lambda *args: compiled(*jax.tree.leaves(args))
 
 
 class KeptProgram(NamedTuple):

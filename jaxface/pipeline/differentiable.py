@@ -25,7 +25,7 @@ from jaxface.stages.fit import (
     FitModel,
     FitWeights,
     fit_hidden_shading,
-    fit_parameters,
+    through_levels,
 )
 from jaxface.stages.unwrap import PartialAlbedo, unwrap
 
@@ -94,11 +94,8 @@ def infer_texture(
         steps: of the synthesis.
         rate: largest change of an intensity in one step.
     """
-    y, stats = fit_parameters(photo, problem.models, fit_weights, config)
-    finest = problem.models[-1]
-    if stats.occlusion is not None:
-        finest = finest.with_occlusion(stats.occlusion)
-    model = finest.model
+    y, _, models = through_levels(photo, problem.models, fit_weights, config)
+    model = models[-1].model
     size = photo.image.shape[0]
     partial = unwrap(
         photo.image, jax.lax.stop_gradient(photo.mask),

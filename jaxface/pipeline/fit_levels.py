@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxface._compilation import quick_compilation
 from jaxface.models.parameters import FaceParameters, neutral_parameters
@@ -17,18 +18,48 @@ from jaxface.stages.fit import (
     FitStats,
     FitWeights,
     LevelRecord,
-    fit_level,
-    fit_shadows,
     fit_start,
-    follows_shadows,
+    level_stages,
     through_levels,
 )
 
 
 @functools.cache
-def _program(stage: Callable[..., Any], level: int) -> KeptProgram:
-    function = functools.partial(stage, level=level)
-    return KeptProgram(f"{stage.__name__}_{level}", function, quick_compilation())
+def _kept(stage: Callable[..., Any], settings: tuple[tuple[str, int], ...]) -> KeptProgram:
+    name = "_".join([stage.__name__, *(f"{key}{value}" for key, value in settings)])
+    return KeptProgram(name, functools.partial(stage, **dict(settings)), quick_compilation())
+
+
+def _program(stage: Callable[..., Any]) -> KeptProgram:
+    if isinstance(stage, functools.partial):
+        return _kept(stage.func, tuple(sorted(stage.keywords.items())))
+    return _kept(stage, ())
+
+
+def begin_compilation(
+    clock: Clock,
+    data: FitInput,
+    models: tuple[FitModel, ...],
+    weights: FitWeights,
+    config: FitConfig,
+) -> Callable[[], None]:
+    """Start to compile what ``fit_levels`` will run; ``data`` may be ``input_shapes``.
+
+    Returns:
+        What takes it back: programs not begun are left, those that are finish in the background.
+    """
+    y = jax.eval_shape(neutral_parameters, models[0].model)
+    keep_structure(y)
+    keep_structure(LevelRecord({}, y.log_focal, y.identity))
+    calls: list[tuple[KeptProgram, tuple[Any, ...]]] = [
+        (_program(fit_start), (data, models[0], weights, config))
+    ]
+    stages = level_stages(data, models, config)
+    for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
+        if shadows is not None:
+            calls.append((_program(shadows), (y, data, model, models[0], config)))
+        calls.append((_program(fitting), (y, data, model, weights, config, jnp.asarray(level))))
+    return clock.begin(calls)
 
 
 def fit_levels(
@@ -38,24 +69,14 @@ def fit_levels(
     weights: FitWeights,
     config: FitConfig,
 ) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
-    """``fit_parameters``, a program a level, so that they compile side by side.
+    """``fit_parameters``, a program a stage, so that they compile side by side.
 
     Returns:
         Parameters, history, and the models with the shadows that they were fitted with.
     """
-    y = jax.eval_shape(neutral_parameters, models[0].model)
-    keep_structure(y)
-    keep_structure(LevelRecord({}, y.log_focal, y.identity))
-    calls: list[tuple[KeptProgram, tuple[Any, ...]]] = [
-        (_program(fit_start, 0), (data, models[0], weights, config))
-    ]
-    for level, model in enumerate(models):
-        if follows_shadows(models, config, level):
-            calls.append((_program(fit_shadows, level), (y, data, model, models[0], config)))
-        calls.append((_program(fit_level, level), (y, data, model, weights, config)))
-    clock.prepare("fit", calls)
+    begin_compilation(clock, data, models, weights, config)
 
-    def call(stage: Callable[..., Any], level: int, *args: Any) -> Any:
-        return clock.run("fit", _program(stage, level), *args)
+    def call(stage: Callable[..., Any], *args: Any) -> Any:
+        return clock.run("fit", _program(stage), *args)
 
     return through_levels(data, models, weights, config, call)

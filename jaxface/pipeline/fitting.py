@@ -18,11 +18,11 @@ from jaxface.imaging.masks import dilate, fill_polygon
 from jaxface.io.image import Photo, read_image
 from jaxface.io.models import load_model
 from jaxface.models.landmark_schemes import CONTOURS, landmarks68
-from jaxface.models.morphable import MorphableModel
+from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
 from jaxface.models.subdivide import subdivide
 from jaxface.pipeline.clock import Clock
-from jaxface.pipeline.fit_levels import fit_levels
+from jaxface.pipeline.fit_levels import begin_compilation, fit_levels
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
@@ -32,6 +32,7 @@ from jaxface.stages.fit import (
     FitWeights,
     Posterior,
     WorkingPhoto,
+    input_shapes,
     posterior,
     prepare,
     render_fit,
@@ -46,6 +47,19 @@ SUBDIVIDED_BELOW = 20_000
 
 _posterior_program = jax.jit(posterior)
 _skin_program = jax.jit(skin_map)
+
+
+@jax.jit
+def _shape_program(model: MorphableModel, y: FaceParameters) -> Float[Array, "n 3"]:
+    return model.shape(y.identity, y.expression)
+
+
+@jax.jit
+def _landmark_program(
+    model: MorphableModel, points: SurfacePoints, y: FaceParameters, principal: Float[Array, "2"]
+) -> Float[Array, "l 2"]:
+    posed = y.pose(points(model.shape(y.identity, y.expression)))
+    return y.camera(principal).project(posed)[:, :2]
 
 
 @dataclass(frozen=True)
@@ -72,7 +86,7 @@ class FittedFace:
     @property
     def vertices(self) -> Float[Array, "n 3"]:
         """Fitted shape in the model's frame, mm."""
-        return self.model.shape(self.parameters.identity, self.parameters.expression)
+        return _shape_program(self.model, self.parameters)
 
     @property
     def size(self) -> int:
@@ -82,11 +96,9 @@ class FittedFace:
     @property
     def fitted_landmarks(self) -> Float[np.ndarray, "l 2"]:
         """Where the fitted mesh has the landmarks, px of the photo (contours not slid)."""
-        y, data = self.parameters, self.working.data
-        posed = y.pose(self.models[-1].points(self.vertices))
-        return self.working.crop.to_photo(
-            np.asarray(y.camera(data.principal).project(posed)[:, :2])
-        )
+        finest, principal = self.models[-1], self.working.data.principal
+        points = _landmark_program(finest.model, finest.points, self.parameters, principal)
+        return self.working.crop.to_photo(np.asarray(points))
 
     def landmark_error(self) -> float:
         """Mean distance over the inner 51 of the 68 points, over that of the outer eye corners."""
@@ -272,24 +284,37 @@ def fit(
     seen = clock.host("read photo", as_photo, photo)
     if not isinstance(model, MorphableModel):
         model = clock.host("load model", load_model, model)
+    model = clock.host("self-shadow", _with_self_shadow, model, self_shadow)
+    weights = weights or FitWeights()
+    config = FitConfig(
+        steps=tuple(steps), extra_terms=tuple(extra_terms), shadow_directions=shadow_directions
+    )
+
+    def prepared(count: int) -> tuple[FitModel, ...]:
+        return clock.host("prepare model", detail_levels, model, count, len(steps), details)
+
     if landmarks is None:
-        found = clock.host("detect landmarks", detector, seen.pixels, face)
+        count = 68 if model.landmarks468 is None else 468
+        models = prepared(count)
+        # The programs take longest: they are compiled while the detector looks.
+        drop = begin_compilation(clock, input_shapes(size, count), models, weights, config)
+        try:
+            found = clock.host("detect landmarks", detector, seen.pixels, face)
+        except BaseException:
+            drop()
+            raise
         landmarks = np.asarray(found.landmarks)[:, :2]
         if model.landmarks468 is None:
             landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
+    else:
+        models = prepared(len(landmarks))
     landmarks = np.asarray(landmarks, np.float64)[:, :2]
-    model = clock.host("self-shadow", _with_self_shadow, model, self_shadow)
-    models = clock.host("prepare model", detail_levels, model, len(landmarks), len(steps), details)
     linear = np.asarray(srgb_to_linear(jnp.asarray(seen.pixels)))
     focal = None
     if seen.focal_35mm:
         focal = seen.focal_35mm / 36.0 * max(linear.shape[:2])
     working = clock.host(
         "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
-    )
-    weights = weights or FitWeights()
-    config = FitConfig(
-        steps=tuple(steps), extra_terms=tuple(extra_terms), shadow_directions=shadow_directions
     )
     parameters, stats, models = fit_levels(clock, working.data, models, weights, config)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):

@@ -94,9 +94,10 @@ def _write_meshes(folder: Path, fitted: FittedFace, textured: Texture | None) ->
     rest = np.asarray(model.mean + model.identity(y.identity))
     basis = np.asarray(model.expression.basis)
     deviations = np.asarray(model.expression.std)
+    expression = np.asarray(y.expression) * deviations
     names = model.expression_names or tuple(f"expression{k:02d}" for k in range(basis.shape[-1]))
     morphs = {n: basis[..., k] / deviations[k] for k, n in enumerate(names)}
-    standing = {n: float(y.expression[k] * deviations[k]) for k, n in enumerate(names)}
+    standing = dict(zip(names, expression.tolist(), strict=True))
     data = fitted.working.data
     picture = (folder / "texture.png").read_bytes() if textured is not None else None
     write_glb(

@@ -23,7 +23,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxface._types import Array, Bool, Float, Int
+from jaxface._numerics import running_count
+from jaxface._types import Array, Float, Int
 from jaxface.render.coverage import (
     TILE_PIXELS,
     Corners,
@@ -103,7 +104,7 @@ def nearest_triangles(
     # Few-fragment tiles first: a batch takes as many rounds as its fullest tile.
     large = (columns > wide) | (rows > high)
     few = ~large & (jax.lax.population_count(rest) <= ROUNDS)
-    first, second = _running_count(jnp.stack([few & (rest != 0), ~few]))
+    first, second = running_count(jnp.stack([few & (rest != 0), ~few]))
     length = first[-1] + second[-1]
     place = jnp.where(few, jnp.where(rest != 0, first - 1, length), first[-1] + second - 1)
     place = jnp.where(place < length, place, scenes * count + batch)
@@ -124,7 +125,7 @@ def nearest_triangles(
         starts = ends - left_over
         mark = jnp.zeros((batch,), jnp.int32)
         mark = mark.at[starts].add((left_over > 0).astype(jnp.int32), mode="drop")
-        owner = jnp.cumsum(mark, dtype=jnp.int32) - 1
+        owner = running_count(mark) - 1
         live = slot < ends[-1]
         tile = slot - starts[owner] + jnp.where(owner == 0, done, 0) + skip[owner]
         here = jax.tree.map(lambda v: v[window[owner]], tiles)
@@ -150,20 +151,6 @@ def nearest_triangles(
 
 def _bits(tiles: Tiles, cull: bool) -> Int[Array, "t"]:
     return tile_bits(tiles.x, tiles.y, *tiles[3:8], cull)
-
-
-def _running_count(flags: Bool[Array, "k t"]) -> Int[Array, "k t"]:
-    """How many flags are set up to and with each: a prefix sum in two levels.
-
-    Blocks are summed by a triangular matrix, since XLA's own prefix sum takes longer on a CPU than
-    all the drawing; zeros and ones are exact in any precision of multiplication.
-    """
-    rows, size = flags.shape
-    blocks = jnp.pad(flags, ((0, 0), (0, -size % 128))).reshape(rows, -1, 128)
-    within = blocks.astype(jnp.float32) @ jnp.triu(jnp.ones((128, 128), jnp.float32))
-    within = within.astype(jnp.int32)
-    before = jnp.cumsum(within[..., -1], axis=1, dtype=jnp.int32) - within[..., -1]
-    return (within + before[..., None]).reshape(rows, -1)[:, :size]
 
 
 def _draw(

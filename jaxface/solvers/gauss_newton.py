@@ -16,7 +16,7 @@ import lineax as lx
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
-from jaxface._types import Array, Float, PyTree
+from jaxface._types import Array, Float, Int, PyTree
 from jaxface.solvers.solution import Solution
 
 
@@ -46,9 +46,9 @@ class _State(eqx.Module):
 class GaussNewton(optx.AbstractMinimiser):
     """Levenberg-Marquardt-damped Gauss-Newton; see ``gauss_newton`` for the plain function.
 
-    Needs ``options={"problem": Problem, "steps": int}``. A step that does not lower the energy
-    is retried with more damping up to ``tries`` times; if none helps the solve has converged to
-    what the arithmetic can resolve.
+    Needs ``options={"problem": Problem, "steps": int, "limit": int or array}``. A step that does
+    not lower the energy is retried with more damping up to ``tries`` times; if none helps the solve
+    has converged to what the arithmetic can resolve.
     """
 
     rtol: float = 1e-5
@@ -74,7 +74,7 @@ class GaussNewton(optx.AbstractMinimiser):
         return _State(
             damping=jnp.asarray(self.damping, f_struct.dtype),
             step=jnp.asarray(0),
-            done=jnp.asarray(steps == 0),
+            done=jnp.asarray(options["limit"] == 0),
             history=dict.fromkeys(names, nan),
             curvature=jnp.zeros((ravel_pytree(y)[0].size,) * 2, f_struct.dtype),
         )
@@ -134,7 +134,7 @@ class GaussNewton(optx.AbstractMinimiser):
         state = _State(
             damping=jnp.clip(damping, 1e-7, 1e3),
             step=state.step + 1,
-            done=~accepted | small | (state.step + 1 >= options["steps"]),
+            done=~accepted | small | (state.step + 1 >= options["limit"]),
             history=history,
             curvature=curvature,
         )
@@ -178,6 +178,7 @@ def gauss_newton(
     args: PyTree = None,
     *,
     steps: int = 30,
+    limit: int | Int[Array, ""] | None = None,
     rtol: float = 1e-5,
     damping: float = 1e-3,
     tries: int = 6,
@@ -196,7 +197,8 @@ def gauss_newton(
         problem: energy, quadratic model and what is refreshed between steps.
         y0: start, a pytree of floating-point arrays.
         args: data, passed on to ``problem.refresh``.
-        steps: greatest number of steps.
+        steps: greatest number of steps, fixed at compile time.
+        limit: greatest number of steps of this call, up to ``steps``; may be traced.
         rtol: stop when a step lowers the energy by less than this share of it.
         damping: initial Levenberg-Marquardt factor, relative to the diagonal.
         tries: attempts, with growing damping, before a step is given up.
@@ -220,7 +222,12 @@ def gauss_newton(
         GaussNewton(rtol=rtol, damping=damping, tries=tries),
         y0,
         args,
-        options={"problem": problem, "steps": steps, "names": {k: k for k in shapes}},
+        options={
+            "problem": problem,
+            "steps": steps,
+            "limit": steps if limit is None else limit,
+            "names": {k: k for k in shapes},
+        },
         has_aux=True,
         max_steps=max(steps, 1),
         throw=False,

@@ -2,8 +2,8 @@
 
 from jaxface.stages.fit.batch import fit_batch
 from jaxface.stages.fit.cast_shadows import cast_shadows
-from jaxface.stages.fit.levels import fit_parameters, follows_shadows, through_levels
-from jaxface.stages.fit.photo import WorkingPhoto, working_photo
+from jaxface.stages.fit.levels import fit_parameters, level_stages, through_levels
+from jaxface.stages.fit.photo import WorkingPhoto, input_shapes, working_photo
 from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
 from jaxface.stages.fit.records import (
@@ -41,7 +41,8 @@ __all__ = [
     "fit_parameters",
     "fit_shadows",
     "fit_start",
-    "follows_shadows",
+    "input_shapes",
+    "level_stages",
     "posterior",
     "prepare",
     "render_fit",

@@ -30,7 +30,9 @@ def fit_batch(
 
     The batch is filled up with copies of the last input to a multiple of the number of devices;
     the copies are dropped from the answer. Steps go on until the slowest photo of a device
-    has converged, so a batch costs its slowest member times its size.
+    has converged, so a batch costs its slowest member times its size. Answers are those of
+    ``fit_parameters`` for one photo after the other, in double precision to 1e-11 mm; in float32
+    rounding decides which pixels at the rim take part, and they differ by 0.03 mm (measured).
 
     Args:
         inputs: working photos, all with the same size and number of landmarks.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxface._numerics import safe_norm
 from jaxface._types import Array, Float
-from jaxface.energies.photometric import PixelSamples, reweighting, thin_samples
+from jaxface.energies.photometric import PixelSamples, reweighting
 from jaxface.geometry.mesh import smooth_over_mesh, vertex_normals
 from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import rotation_matrix
@@ -100,7 +100,7 @@ def cast_shadows(
     lattice = jnp.asarray(towards, shape.dtype)
     casting = occluder.shape(y.identity, y.expression) @ rotation.T
     hidden = hidden_directions(turned, normals, casting, occluder.faces, towards)
-    samples = thin_samples(visible_samples(y, image, mask, data, model), pixels)
+    samples = visible_samples(y, image, mask, len(image), data, model, pixels)
     camera = y.camera(samples.principal)
     rays = pixel_rays(samples.position, camera.focal, camera.principal)
     share = ray_weights(rays, turned[samples.triangle] + y.translation)

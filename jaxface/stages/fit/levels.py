@@ -1,12 +1,15 @@
 """The whole fit: its stages in their order."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
+
+import jax.numpy as jnp
 
 from jaxface.models.parameters import FaceParameters
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitInput, FitStats, FitWeights, join_records
-from jaxface.stages.fit.solve import fit_level, fit_shadows, fit_start
+from jaxface.stages.fit.solve import fit_level, fit_shadows, fit_start, level_side
 
 
 def fit_parameters(
@@ -26,9 +29,7 @@ def fit_parameters(
     Returns:
         The parameters and the history.
     """
-    y, stats, _ = through_levels(
-        data, models, weights, config, lambda stage, level, *args: stage(*args, level)
-    )
+    y, stats, _ = through_levels(data, models, weights, config)
     return y, stats
 
 
@@ -37,7 +38,7 @@ def through_levels(
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
-    call: Callable[..., Any],
+    call: Callable[..., Any] = lambda stage, *args: stage(*args),
 ) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
     """The stages of ``fit_parameters`` in their order, each made by ``call``.
 
@@ -46,26 +47,45 @@ def through_levels(
         models: the model at each level of detail, coarsest first.
         weights: term weights.
         config: steps and sizes.
-        call: ``call(stage, level, *args)`` with the answer of ``stage(*args, level)``, where stage
-            is ``fit_start``, ``fit_shadows`` or ``fit_level``.
+        call: ``call(stage, *args)`` with the answer of ``stage(*args)``, where stage is one of
+            ``level_stages``.
 
     Returns:
         Parameters, history, and the models with the shadows that they were fitted with.
     """
-    y, record = call(fit_start, 0, data, models[0], weights, config)
+    y, record = call(fit_start, data, models[0], weights, config)
     records, shadowed, occlusion = [record], [], None
-    for level, model in enumerate(models):
-        if follows_shadows(models, config, level):
-            y, occlusion = call(fit_shadows, level, y, data, model, models[0], config)
+    stages = level_stages(data, models, config)
+    for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
+        if shadows is not None:
+            y, occlusion = call(shadows, y, data, model, models[0], config)
         if occlusion is not None:
             model = model.with_occlusion(occlusion)
-        y, record = call(fit_level, level, y, data, model, weights, config)
+        y, record = call(fitting, y, data, model, weights, config, jnp.asarray(level))
         records.append(record)
         shadowed.append(model)
     return y, join_records(records, shadowed[-1].model.occlusion), tuple(shadowed)
 
 
-def follows_shadows(models: tuple[FitModel, ...], config: FitConfig, level: int) -> bool:
+def level_stages(
+    data: FitInput, models: tuple[FitModel, ...], config: FitConfig
+) -> list[tuple[functools.partial[Any] | None, functools.partial[Any]]]:
+    """Of each level ``fit_shadows``, if it is due, and ``fit_level``, with their static settings.
+
+    Levels of one mesh have one canvas, the largest of their images, and so one program.
+    """
+    counts = [model.model.vertex_count for model in models]
+    sides = [level_side(data, config, level) for level in range(len(models))]
+    stages = []
+    for level, count in enumerate(counts):
+        canvas = max(s for s, c in zip(sides, counts, strict=True) if c == count)
+        shadows = functools.partial(fit_shadows, level=level)
+        due = _follows_shadows(models, config, level)
+        stages.append((shadows if due else None, functools.partial(fit_level, canvas=canvas)))
+    return stages
+
+
+def _follows_shadows(models: tuple[FitModel, ...], config: FitConfig, level: int) -> bool:
     """Whether hard shadows are looked for before a level.
 
     Not before the first, where the shape is still that of the landmarks alone; before the second,

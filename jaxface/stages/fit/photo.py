@@ -1,6 +1,6 @@
 """From a photo and its landmarks to the input of a fit, on the host."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,30 @@ def landmark_weights(count: int) -> Float[np.ndarray, "l"]:
 
 
 _oval_mask = jax.jit(face_oval_mask, static_argnums=(1, 2))
+
+
+def input_shapes(size: int, landmarks: int) -> FitInput:
+    """Shapes and types of any photo's input for a fit, in place of its arrays.
+
+    Args:
+        size: side of the working image, px.
+        landmarks: how many points there are.
+    """
+
+    def array(*shape: int, dtype: Any = float) -> Any:
+        return jax.ShapeDtypeStruct(shape, jnp.result_type(dtype))
+
+    return FitInput(
+        image=array(size, size, 3),
+        mask=array(size, size),
+        landmarks=array(landmarks, 2),
+        landmark_weight=array(landmarks),
+        landmark_unit=array(),
+        principal=array(2),
+        log_focal=array(),
+        log_focal_deviation=array(),
+        estimate_inliers=array(dtype=bool),
+    )
 
 
 class WorkingPhoto(NamedTuple):
@@ -105,7 +129,7 @@ def working_photo(
     gain = 0.5 / level
 
     def array(value):
-        return jnp.asarray(value, jnp.result_type(float))
+        return jax.device_put(np.asarray(value, jnp.result_type(float)))
 
     data = FitInput(
         image=array(crop.image * gain),

@@ -80,4 +80,4 @@ def _in_regions(model: MorphableModel, names: tuple[str, ...]) -> np.ndarray:
     known = [name for name in names if name in model.region_names]
     if not known:
         return np.ones(model.vertex_count, bool)
-    return np.asarray(model.region_mask(*known))
+    return np.isin(np.asarray(model.region), [model.region_names.index(name) for name in known])

@@ -36,9 +36,10 @@ class FitConfig(eqx.Module):
     """Gauss-Newton steps on each pyramid level, coarsest first"""
     landmark_steps: int = eqx.field(static=True, default=15)
     """steps on landmarks and prior alone, before the first level"""
-    curvature_pixels: int = eqx.field(static=True, default=6000)
-    """pixels (evenly spread) on which the Jacobian is formed, half as many before the last level;
-    the gradient uses all"""
+    compared_pixels: int = eqx.field(static=True, default=32768)
+    """pixels (evenly spread) on which energy and gradient are formed, at most"""
+    curvature_pixels: int = eqx.field(static=True, default=3000)
+    """pixels (evenly spread) of these on which the Jacobian is formed"""
     shadow_directions: int = eqx.field(static=True, default=256)
     """directions of light whose hard shadows are followed (``cast_shadows``); 0: soft ones only"""
     rtol: float = eqx.field(static=True, default=1e-5)
@@ -86,7 +87,8 @@ class FitStats(eqx.Module):
     """History of a fit, one entry a level (the first is the landmark-only start)."""
 
     energies: tuple[dict[str, Array], ...]
-    """per level: (steps + 1,) energy of every term before each step and after the last"""
+    """per level: energy of every term before each step and after the last, one entry more than the
+    most steps of any level, NaN where unused"""
     steps: tuple[Array, ...]
     """steps used on each level"""
     curvature: Float[Array, "p p"]

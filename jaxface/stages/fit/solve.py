@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._numerics import safe_norm
-from jaxface._types import Array, Float
+from jaxface._types import Array, Float, Int
 from jaxface.energies.landmark import (
     LandmarkData,
     landmark_difference,
@@ -98,11 +98,11 @@ def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
 
 
 def fit_start(
-    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig, level: int = 0
+    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
 ) -> tuple[FaceParameters, LevelRecord]:
     """Before the first level: pose and coefficients from the landmarks, light in closed form."""
     y, record = fit_landmarks(data, model, weights, config)
-    image, mask = _level_image(data, len(config.steps), level)
+    image, mask, _ = level_image(data, len(config.steps), 0, level_side(data, config, 0))
     return initial_light(y, image, mask, data, model), record
 
 
@@ -112,10 +112,11 @@ def fit_shadows(
     model: FitModel,
     coarsest: FitModel,
     config: FitConfig,
+    *,
     level: int,
 ) -> tuple[FaceParameters, Float[Array, "n 9"]]:
     """Light, and the transfer of its cast shadows, from the fit of the level before."""
-    image, mask = _level_image(data, len(config.steps), level)
+    image, mask, _ = level_image(data, len(config.steps), level, level_side(data, config, level))
     return cast_shadows(
         y, image, mask, data, model, coarsest.model, directions=config.shadow_directions
     )
@@ -127,20 +128,37 @@ def fit_level(
     model: FitModel,
     weights: FitWeights,
     config: FitConfig,
-    level: int,
+    level: int | Int[Array, ""],
+    *,
+    canvas: int,
 ) -> tuple[FaceParameters, LevelRecord]:
-    """One pyramid level (0 is the coarsest) from the parameters of the last."""
+    """One pyramid level (0 is the coarsest) from the parameters of the last.
+
+    Args:
+        y: where the level before ended.
+        data: the photo.
+        model: level of detail.
+        weights: of the terms.
+        config: settings.
+        level: may be traced, so that levels of one mesh share a program.
+        canvas: side (px) that the level's image is filled up to, at least its own.
+    """
     energy = fit_energy(None, config.extra_terms)
-    # A coarse image has no more to say of the curvature than every other of its pixels.
-    pixels = config.curvature_pixels // (2 if level + 1 < len(config.steps) else 1)
     problem = Problem(
         energy=energy.value,
         quadratic=energy.quadratic,
-        refresh=lambda y, args: observe(y, *args, curvature_pixels=pixels),
+        refresh=lambda y, args: observe(y, *args, config=config),
     )
-    image, mask = _level_image(data, len(config.steps), level)
-    args = (image, mask, data, model, normal_modes(y, model.model, model.stencil), weights)
-    solution = gauss_newton(problem, y, args, steps=config.steps[level], rtol=config.rtol)
+    image, mask, side = level_image(data, len(config.steps), level, canvas)
+    modes = normal_modes(y, model.model, model.stencil)
+    solution = gauss_newton(
+        problem,
+        y,
+        (image, mask, side, data, model, modes, weights),
+        steps=max(config.steps),
+        limit=jnp.asarray(config.steps)[level],
+        rtol=config.rtol,
+    )
     return solution.value, _record(solution)
 
 
@@ -149,29 +167,51 @@ def _record(solution: Solution) -> LevelRecord:
     return LevelRecord(stats["history"], stats["num_steps"], stats["curvature"])
 
 
-def _level_image(data: FitInput, levels: int, level: int) -> tuple[Array, Array]:
+def level_side(data: FitInput, config: FitConfig, level: int) -> int:
+    """Side of a level's image, px."""
+    return data.image.shape[0] >> (len(config.steps) - 1 - level)
+
+
+def level_image(
+    data: FitInput, levels: int, level: int | Int[Array, ""], canvas: int
+) -> tuple[Float[Array, "s s 3"], Float[Array, "s s"], Float[Array, ""]]:
+    """A level's image and mask, filled up with zeros to a canvas, and its own side in px."""
     both = jnp.concatenate([data.image, data.mask[..., None]], axis=-1)
-    shrunk = pyramid(both, levels)[levels - 1 - level]
-    return shrunk[..., :3], shrunk[..., 3]
+    held = [shrunk for shrunk in pyramid(both, levels)[::-1] if len(shrunk) <= canvas]
+    filled = jnp.stack([jnp.pad(x, [(0, canvas - len(x))] * 2 + [(0, 0)]) for x in held])[level]
+    side = jnp.array([len(x) for x in held], filled.dtype)[level]
+    return filled[..., :3], filled[..., 3], side
 
 
 def observe(
     y: FaceParameters,
     image: Float[Array, "s s 3"],
     mask: Float[Array, "s s"],
+    side: float | Float[Array, ""],
     data: FitInput,
     model: FitModel,
     modes: Float[Array, "n 3 k"],
     weights: FitWeights,
     *,
-    curvature_pixels: int,
+    config: FitConfig,
 ) -> FitData:
     """What is visible at ``y``: the pixel lists and where contour landmarks attach.
 
     No gradient passes: visibility and inliers are choices, held fixed by every derivative.
+
+    Args:
+        y: the unknowns.
+        image: linear RGB; beyond ``side`` rows and columns it is empty.
+        mask: valid face pixels, 0 to 1, and 0 beyond ``side``.
+        side: of the working image at this level, px.
+        data: the photo's landmarks and camera.
+        model: level of detail.
+        modes: derivative of the vertex normals along the shape modes (``normal_modes``).
+        weights: of the terms.
+        config: how many pixels are compared.
     """
     y = jax.lax.stop_gradient(y)
-    samples = visible_samples(y, image, mask, data, model)
+    samples = visible_samples(y, image, mask, side, data, model, config.compared_pixels)
     trusted = shadow_trust(y, model.model, samples)
     samples = eqx.tree_at(lambda s: s.weight, samples, samples.weight * trusted)
     synth = synthesize(y, model.model, samples)
@@ -189,7 +229,7 @@ def observe(
     return FitData(
         photo=PhotometricData(model.model, samples),
         photo_trust=jnp.where(weights.noise > 0, trust, 1.0),
-        curvature_samples=thin_samples(samples, curvature_pixels),
+        curvature_samples=thin_samples(samples, config.curvature_pixels),
         landmark=eqx.tree_at(lambda d: d.weight, landmark, robust),
         normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
