@@ -1,10 +1,9 @@
 """The fit on pictures of the bundled model, whose answer is known."""
 
+import dataclasses
 import os
 import subprocess
 import sys
-
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +19,15 @@ from jaxface.stages.fit import (
     FitWeights,
     fit_batch,
     fit_parameters,
+    input_shapes,
     posterior,
     prepare,
     render_fit,
     working_photo,
 )
 from jaxface.stages.fit.inliers import inlier_weights
+from jaxface.stages.fit.solve import level_image, level_side
+from jaxface.stages.fit.visible import visible_samples
 
 STEPS = (8, 3)
 SIZE = 128
@@ -136,6 +138,29 @@ def test_exposure_does_not_matter(model, known):
     dark = working_photo(photo * 0.1, points, size=SIZE)
     np.testing.assert_allclose(bright.data.image, dark.data.image, rtol=1e-4, atol=1e-5)
     assert dark.gain == pytest.approx(10 * bright.gain, rel=1e-4)
+
+
+def test_a_level_shows_the_same_pixels_on_a_larger_canvas(fitted):
+    working, models, config, y, _ = fitted
+    assert level_side(working.data, config, 0) == SIZE // 2
+    lists = []
+    for canvas in (SIZE // 2, SIZE):
+        image, mask, side = level_image(working.data, len(STEPS), jnp.asarray(0), canvas)
+        assert image.shape == (canvas, canvas, 3) and float(side) == SIZE // 2
+        found = visible_samples(y, image, mask, side, working.data, models[0], 2000)
+        used = np.asarray(found.weight) > 0
+        lists.append([np.asarray(x)[used] for x in (found.position, found.triangle, found.color)])
+    assert len(lists[0][0]) > 300
+    for small, large in zip(*lists, strict=True):
+        np.testing.assert_array_equal(small, large)
+
+
+def test_input_shapes_are_those_of_a_working_photo(fitted):
+    data = fitted[0].data
+    expected = input_shapes(SIZE, 468)
+    assert jax.tree.structure(data) == jax.tree.structure(expected)
+    for found, shape in zip(jax.tree.leaves(data), jax.tree.leaves(expected), strict=True):
+        assert (found.shape, found.dtype) == (shape.shape, shape.dtype)
 
 
 @pytest.mark.slow

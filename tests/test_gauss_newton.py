@@ -102,6 +102,20 @@ def test_descends_where_plain_gauss_newton_diverges(x64):
     assert (np.diff(history) <= 0).all()
 
 
+@pytest.mark.parametrize("limit", [0, 1, 3])
+def test_the_limit_of_a_call_may_be_traced(x64, limit):
+    def run(limit=None, steps=limit):
+        problem = _problem(lambda y, args: jnp.arctan(y))
+        return gauss_newton(problem, jnp.array([3.0]), steps=steps, limit=limit, rtol=0.0)
+
+    found = jax.jit(lambda n: run(n, 10))(limit)
+    expected = run()
+    np.testing.assert_allclose(found.value, expected.value)
+    assert int(found.stats["num_steps"]) == int(expected.stats["num_steps"])
+    total = np.asarray(found.stats["history"]["total"])
+    assert total.shape == (11,) and np.isnan(total[limit + 1 :]).all()
+
+
 def test_linear_problem_is_solved_by_normal_equations(x64):
     rng = np.random.default_rng(0)
     a, b = jnp.asarray(rng.normal(size=(20, 5))), jnp.asarray(rng.normal(size=20))

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxface._compilation import quick_jit
-from jaxface._numerics import cross, safe_divide, safe_norm, safe_normalize, safe_sqrt
+from jaxface._numerics import (
+    cross,
+    running_count,
+    safe_divide,
+    safe_norm,
+    safe_normalize,
+    safe_sqrt,
+)
 
 
 @given(st.integers(-150, 150), st.integers(0, 1000))
@@ -43,6 +50,19 @@ def test_cross_is_the_cross_product(x64):
     a, b = jnp.asarray(rng.normal(size=(5, 1, 3))), jnp.asarray(rng.normal(size=(4, 3)))
     np.testing.assert_allclose(cross(a, b), np.cross(a, b), atol=1e-15)
     check_grads(cross, (a, b), 2, ("fwd", "rev"))
+
+
+@pytest.mark.parametrize("size", [1, 127, 128, 129, 16384, 16385, 2_100_000])
+def test_running_count_is_the_prefix_sum(size):
+    flags = np.random.default_rng(size).uniform(size=size) < 0.9
+    found = jax.jit(running_count)(jnp.asarray(flags))
+    assert found.dtype == jnp.int32
+    np.testing.assert_array_equal(found, np.cumsum(flags))
+
+
+def test_running_count_of_a_batch_runs_along_the_last_axis():
+    flags = np.random.default_rng(0).integers(0, 2, (2, 3, 300))
+    np.testing.assert_array_equal(running_count(jnp.asarray(flags)), np.cumsum(flags, axis=-1))
 
 
 def test_division_by_zero_gives_what_is_asked():
