@@ -26,6 +26,9 @@ _NARROW, _WIDE = 2, 64
 """on CPUs ``auto`` means shifted sums up to the one, Winograd from the other number of channels;
 the fewer channels, the more of Winograd's time are its transforms, on one core"""
 
+_LARGE = 2048
+"""pixels of an image from which on Winograd pays for the transform of the kernel"""
+
 
 def conv3x3(
     x: Float[Array, "h w i"], kernel: Float[Array, "3 3 i o"], method: str = "auto"
@@ -77,12 +80,13 @@ def direct_conv3x3(
     return lax.conv_general_dilated(x[None], kernel, (1, 1), "SAME", dimension_numbers=layout)[0]
 
 
-def _algorithm(kernel: Array, method: str, platform: str) -> str:
+def _algorithm(x: Array, kernel: Array, method: str, platform: str) -> str:
     if method != "auto":
         return method
     if platform == "cpu" and kernel.shape[2] <= _NARROW:
         return "shifted sum"
-    return "winograd" if platform == "cpu" and min(kernel.shape[2:]) >= _WIDE else "direct"
+    suits = min(kernel.shape[2:]) >= _WIDE and x.shape[0] * x.shape[1] >= _LARGE
+    return "winograd" if platform == "cpu" and suits else "direct"
 
 
 def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array]) -> None:
@@ -126,7 +130,7 @@ _OPPOSITE = {"no": "no", "input": "output", "output": "input"}
 def _linear(
     x: Array, kernel: Array, gate: Array, *, gated: str, transpose: bool, method: str, platform: str
 ) -> Array:
-    algorithm = _algorithm(kernel, method, platform)
+    algorithm = _algorithm(x, kernel, method, platform)
     if gated == "input" and algorithm != "winograd":
         x = jnp.where(gate, x, 0)
     if algorithm == "winograd":
@@ -180,7 +184,7 @@ _layer_p = jax.extend.core.Primitive("conv3x3_relu")
 
 
 def _layer(x: Array, kernel: Array, bias: Array, *, method: str, platform: str) -> Array:
-    algorithm = _algorithm(kernel, method, platform)
+    algorithm = _algorithm(x, kernel, method, platform)
     if algorithm == "winograd":
         return winograd_conv3x3(x, kernel, bias)
     if algorithm == "shifted sum":

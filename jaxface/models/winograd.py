@@ -64,8 +64,9 @@ _OUTPUT = np.array(
     ]
 )
 
-_TILES_AT_ONCE = 192
-"""tiles of a strip, as far as whole rows allow; bounds the transformed tiles to a few MB"""
+_TILES_AT_ONCE = 128
+"""tiles of a strip at most, as far as whole rows allow: the transformed tiles stay in a core's own
+cache, and a strip is still enough for an efficient matrix product"""
 
 
 def winograd_conv3x3(
@@ -87,12 +88,15 @@ def winograd_conv3x3(
         bias: where given, the result is ``max(result + bias, 0)``.
         gate: where given, ``x`` counts only where this is true.
         transpose: compute the adjoint, from o channels to i.
-        tiles_at_once: about how many tiles are transformed at a time.
+        tiles_at_once: how many tiles are transformed at a time, if a row has no more.
     """
     height, width, channels = x.shape
     outputs = kernel.shape[2 if transpose else 3]
     columns, rows = -(-width // TILE), -(-height // TILE)
-    strips = -(-rows // max(1, min(rows, round(tiles_at_once / columns))))
+    # Rows of a strip that divide those of the image: a last strip that overhangs costs a copy.
+    most = max(1, min(rows, tiles_at_once // columns))
+    even = max(n for n in range(1, most + 1) if rows % n == 0)
+    strips = rows // even if 2 * even > most else -(-rows // most)
     rows = -(-rows // strips)  # of a strip
     step = rows * TILE
     size = (step + 2, columns * TILE + 2, channels)
