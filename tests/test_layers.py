@@ -9,13 +9,14 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "jaxface"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-BASE = {"_types", "_numerics"}
+BASE = {"_types", "_numerics", "_machine"}
 NUMERICAL = BASE | {"geometry", "imaging", "models", "render", "energies", "solvers"}
 
 # layer -> the layers it may import. Every layer may import itself, except stages (see below).
 ALLOWED = {
     "_types": set(),
     "_numerics": {"_types"},
+    "_machine": set(),
     "_compilation": {"_types"},
     "geometry": BASE,
     "imaging": BASE,

@@ -10,6 +10,8 @@ from pathlib import Path
 import jax
 import platformdirs
 
+from jaxface._machine import processor_features
+
 ENVIRONMENT = "JAXFACE_CACHE"
 
 
@@ -64,12 +66,7 @@ def enable_compilation_cache(
 
 def _processor_tag() -> str:
     """Name of this kind of processor, for a home folder may be shared by several kinds."""
-    features = platform.processor()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            features = next(x for x in lines if x.lower().startswith(("flags", "features")))
-    except (OSError, StopIteration):
-        pass  # no such file outside Linux
+    features = processor_features() or platform.processor()
     return f"{platform.machine() or 'any'}-{zlib.crc32(features.encode()):08x}"
 
 

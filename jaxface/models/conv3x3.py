@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import core, lax
 from jax.interpreters import ad, batching, mlir
 
+from jaxface._machine import processor_features
 from jaxface._types import Array, Float
 from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
 from jaxface.models.winograd import winograd_conv3x3
@@ -22,9 +23,10 @@ from jaxface.models.winograd import winograd_conv3x3
 METHODS = ("auto", "winograd", "direct")
 """``auto``: on CPUs wide layers by Winograd, the first by shifted sums; direct elsewhere"""
 
-_NARROW, _WIDE = 2, 64
-"""on CPUs ``auto`` means shifted sums up to the one, Winograd from the other number of channels;
-the fewer channels, the more of Winograd's time are its transforms, on one core"""
+_NARROW, _WIDE, _WIDE_AVX512 = 2, 64, 256
+"""on CPUs ``auto`` means shifted sums up to the first, Winograd from the second number of channels
+or, where products are twice as fast, the third; the fewer channels, the more of Winograd's time are
+its transforms, on one core"""
 
 _LARGE = 2048
 """pixels of an image from which on Winograd pays for the transform of the kernel"""
@@ -85,8 +87,10 @@ def _algorithm(x: Array, kernel: Array, method: str, platform: str) -> str:
         return method
     if platform == "cpu" and kernel.shape[2] <= _NARROW:
         return "shifted sum"
-    suits = min(kernel.shape[2:]) >= _WIDE and x.shape[0] * x.shape[1] >= _LARGE
-    return "winograd" if platform == "cpu" and suits else "direct"
+    if platform != "cpu" or x.shape[0] * x.shape[1] < _LARGE:
+        return "direct"
+    wide = _WIDE_AVX512 if "avx512f" in processor_features() else _WIDE
+    return "winograd" if min(kernel.shape[2:]) >= wide else "direct"
 
 
 def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array]) -> None:
