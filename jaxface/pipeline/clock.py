@@ -40,8 +40,9 @@ class Clock:
     def begin(self, calls: Sequence[tuple[Any, tuple[PyTree, ...]]]) -> Callable[[], None]:
         """Compile programs side by side in the background, for ``run`` to find them.
 
-        XLA compiles one program on one core, and without holding Python's lock. What ``run`` has
-        to wait for them counts as compilation.
+        XLA compiles one program on one core, and without holding Python's lock. One core is left
+        to the caller, and the last programs come first: ``run`` compiles by itself what it needs
+        and finds not begun. What it has to wait for counts as compilation.
 
         Args:
             calls: programs and their arguments, which may be ``jax.ShapeDtypeStruct``s.
@@ -49,8 +50,8 @@ class Clock:
         Returns:
             What drops those that are not begun yet.
         """
-        pool = ThreadPoolExecutor(os.cpu_count())
-        for program, args in calls:
+        pool = ThreadPoolExecutor(max((os.cpu_count() or 1) - 1, 1))
+        for program, args in reversed(calls):
             pool.submit(_compiled, program, *args)
         pool.shutdown(wait=False)
         return functools.partial(pool.shutdown, wait=False, cancel_futures=True)
