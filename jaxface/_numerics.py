@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Float, Int, Shaped
 
@@ -48,10 +49,20 @@ def safe_divide(
     return jnp.where(zero, fill, numerator / jnp.where(zero, 1.0, denominator))
 
 
+_SIGNS = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _SIGNS[_i, _j, _k], _SIGNS[_j, _i, _k] = 1.0, -1.0
+_SIGNS = _SIGNS.reshape(9, 3)
+
+
 def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Cross product, of operations that XLA fuses; `jnp.cross` cuts its vectors into columns."""
-    products = a * jnp.roll(b, -1, axis=-1) - jnp.roll(a, -1, axis=-1) * b
-    return jnp.roll(products, -1, axis=-1)
+    """Cross product, as one matrix of signs times the products of the entries.
+
+    Differences of columns, as `jnp.cross` takes them, would each be compiled on their own.
+    """
+    products = a[..., :, None] * b[..., None, :]
+    signs = jnp.asarray(_SIGNS, products.dtype)
+    return jnp.matmul(products.reshape(*products.shape[:-2], 9), signs, precision="highest")
 
 
 def safe_sqrt(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -50,21 +50,20 @@ _FORMS = _quadratic_forms()
 
 def sh_basis(normals: Float[Array, "*batch 3"]) -> Float[Array, "*batch 9"]:
     """The nine functions H(n) at unit normals, order and constants as stated above."""
-    x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
-    return jnp.stack(
-        [
-            jnp.full_like(x, Y0),
-            Y1 * y,
-            Y1 * z,
-            Y1 * x,
-            Y2 * x * y,
-            Y2 * y * z,
-            Y20 * (3.0 * z * z - 1.0),
-            Y2 * x * z,
-            Y22 * (x * x - y * y),
-        ],
-        axis=-1,
-    )
+    # As products of matrices: nine columns put side by side would each be compiled on their own.
+    forms = jnp.asarray(_FORMS, normals.dtype)
+    return _forms_at(normals, forms)
+
+
+def _forms_at(
+    normals: Float[Array, "*batch 3"], forms: Float[Array, "k 4 4"]
+) -> Float[Array, "*batch k"]:
+    """Quadratic forms ``(n, 1)^T Q_k (n, 1)``."""
+    squares = (normals[..., :, None] * normals[..., None, :]).reshape(*normals.shape[:-1], 9)
+    square = forms[:, :3, :3].reshape(-1, 9).T
+    linear, constant = 2.0 * forms[:, :3, 3].T, forms[:, 3, 3]
+    by_squares = jnp.matmul(squares, square, precision="highest")
+    return by_squares + jnp.matmul(normals, linear, precision="highest") + constant
 
 
 @jax.custom_jvp
@@ -76,20 +75,17 @@ def irradiance(
     ``L`` holds the coefficients of the shading itself, with the cosine lobe already in it; see
     ``light_from_radiance``. The value may be negative where the second order rings.
     """
-    return sh_basis(normals) @ light
+    return _forms_at(normals, _light_forms(light))
 
 
 @irradiance.defjvp
 def _irradiance_jvp(
     primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    # As one form of the light, since the columns of `sh_basis` would each be differentiated, and
-    # compiled, on their own.
     (normals, light), (turned, changed) = primals, tangents
-    basis = sh_basis(normals)
     slope = irradiance_slope(normals, light)
     change = jnp.einsum("...cx,...x->...c", slope, turned, precision="highest")
-    return basis @ light, change + basis @ changed
+    return irradiance(normals, light), change + irradiance(normals, changed)
 
 
 def irradiance_slope(
@@ -100,10 +96,14 @@ def irradiance_slope(
     Twice ``M_c (n, 1)``, since irradiance is the quadratic form ``(n, 1)^T M_c (n, 1)`` of each
     colour (Ramamoorthi & Hanrahan 2001, equations 11 and 12).
     """
-    forms = jnp.asarray(_FORMS, light.dtype)
-    matrices = 2.0 * jnp.einsum("kc,kij->cij", light, forms, precision="highest")
+    matrices = 2.0 * _light_forms(light)
     turned = jnp.einsum("...i,cij->...cj", normals, matrices[:, :3, :3], precision="highest")
     return turned + matrices[:, 3, :3]
+
+
+def _light_forms(light: Float[Array, "9 3"]) -> Float[Array, "3 4 4"]:
+    """``M_c``: each colour's irradiance as a quadratic form of (n, 1)."""
+    return jnp.einsum("kc,kij->cij", light, jnp.asarray(_FORMS, light.dtype), precision="highest")
 
 
 def light_from_radiance(radiance: Float[Array, "9 3"]) -> Float[Array, "9 3"]:
