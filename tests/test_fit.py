@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from jaxface.stages.fit import (
     fit_batch,
     fit_parameters,
     input_shapes,
+    level_stages,
     posterior,
     prepare,
     render_fit,
@@ -153,6 +155,24 @@ def test_a_level_shows_the_same_pixels_on_a_larger_canvas(fitted):
     assert len(lists[0][0]) > 300
     for small, large in zip(*lists, strict=True):
         np.testing.assert_array_equal(small, large)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "canvases", "shadows"),
+    [
+        ((10, 40, 40), (128, 512, 512), (None, 1, None)),
+        ((40, 40, 40), (128, 512, 512), (None, 1, None)),
+        ((10, 40, 160), (128, 256, 512), (None, 1, 2)),
+        ((40, 40, 40, 40), (128, 128, 512, 512), (None, 1, None, None)),
+        ((10,), (512,), (None,)),
+    ],
+)
+def test_levels_of_one_mesh_share_a_canvas_in_pairs(vertices, canvases, shadows):
+    data = SimpleNamespace(image=np.zeros((512, 512, 3)))
+    models = [SimpleNamespace(model=SimpleNamespace(vertex_count=n, occlusion=1)) for n in vertices]
+    found = level_stages(data, models, FitConfig(steps=(3,) * len(vertices)))
+    assert tuple(fitting.keywords["canvas"] for _, fitting in found) == canvases
+    assert tuple(due and due.keywords["level"] for due, _ in found) == shadows
 
 
 def test_input_shapes_are_those_of_a_working_photo(fitted):

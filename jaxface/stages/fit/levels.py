@@ -72,13 +72,15 @@ def level_stages(
 ) -> list[tuple[functools.partial[Any] | None, functools.partial[Any]]]:
     """Of each level ``fit_shadows``, if it is due, and ``fit_level``, with their static settings.
 
-    Levels of one mesh have one canvas, the largest of their images, and so one program.
+    Two levels of one mesh share a canvas and so a program, in pairs from the finest: the coarser
+    one's image fills a quarter of it. To share it with a third would cost that more than it saves.
     """
     counts = [model.model.vertex_count for model in models]
-    sides = [level_side(data, config, level) for level in range(len(models))]
     stages = []
     for level, count in enumerate(counts):
-        canvas = max(s for s, c in zip(sides, counts, strict=True) if c == count)
+        coarser_of_pair = (len(counts) - level) % 2 == 0
+        shared = coarser_of_pair and counts[level + 1] == count
+        canvas = level_side(data, config, level + 1 if shared else level)
         shadows = functools.partial(fit_shadows, level=level)
         due = _follows_shadows(models, config, level)
         stages.append((shadows if due else None, functools.partial(fit_level, canvas=canvas)))
