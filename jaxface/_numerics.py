@@ -49,10 +49,10 @@ def safe_divide(
     return jnp.where(zero, fill, numerator / jnp.where(zero, 1.0, denominator))
 
 
-_SIGNS = np.zeros((3, 3, 3))
+LEVI_CIVITA = np.zeros((3, 3, 3))
+"""the sign of the permutation (i, j, k), 0 where an index repeats"""
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _SIGNS[_i, _j, _k], _SIGNS[_j, _i, _k] = 1.0, -1.0
-_SIGNS = _SIGNS.reshape(9, 3)
+    LEVI_CIVITA[_i, _j, _k], LEVI_CIVITA[_j, _i, _k] = 1.0, -1.0
 
 
 def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
@@ -61,7 +61,7 @@ def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Arr
     Differences of columns, as `jnp.cross` takes them, would each be compiled on their own.
     """
     products = a[..., :, None] * b[..., None, :]
-    signs = jnp.asarray(_SIGNS, products.dtype)
+    signs = jnp.asarray(LEVI_CIVITA.reshape(9, 3), products.dtype)
     return jnp.matmul(products.reshape(*products.shape[:-2], 9), signs, precision="highest")
 
 
@@ -84,7 +84,7 @@ def running_count(flags: Shaped[Array, "*batch t"]) -> Int[Array, "*batch t"]:
         blocks = jnp.pad(values, [*edges, (0, -size % 128)])
         blocks = blocks.reshape(*values.shape[:-1], -1, 128)
         upper = jnp.triu(jnp.ones((128, 128), jnp.float32))
-        within = jnp.matmul(blocks, upper, precision=jax.lax.Precision.HIGHEST)
+        within = jnp.matmul(blocks, upper, precision="highest")
         if within.shape[-2] > 1:
             sums = within[..., -1]
             within = within + (summed(sums) - sums)[..., None]

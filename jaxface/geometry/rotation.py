@@ -4,17 +4,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from jaxface._numerics import LEVI_CIVITA
 from jaxface._types import Array, Float
-
-_SKEW = np.zeros((3, 3, 3))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _SKEW[_j, _i, _k], _SKEW[_i, _j, _k] = 1.0, -1.0
 
 
 def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return jnp.tensordot(jnp.asarray(_SKEW, v.dtype), v, 1, precision="highest")
+    return jnp.tensordot(jnp.asarray(-LEVI_CIVITA, v.dtype), v, 1, precision="highest")
 
 
 @functools.partial(jax.jit, inline=True)

@@ -1,7 +1,8 @@
 """The levels of a fit as programs, compiled side by side and kept between processes."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -36,17 +37,24 @@ def _program(stage: Callable[..., Any]) -> KeptProgram:
     return _kept(stage, ())
 
 
-def begin_compilation(
+@contextlib.contextmanager
+def compiling_levels(
     clock: Clock,
     data: FitInput,
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
-) -> Callable[[], None]:
-    """Start to compile what ``fit_levels`` will run; ``data`` may be ``input_shapes``.
+) -> Iterator[None]:
+    """Compile what ``fit_levels`` will run beside what is done inside the ``with``.
 
-    Returns:
-        What takes it back: programs not begun are left, those that are finish in the background.
+    If that raises, programs not begun are dropped; those that are finish in the background.
+
+    Args:
+        clock: compiles, and runs the programs later.
+        data: the input, or ``input_shapes``.
+        models: as for ``fit_parameters``.
+        weights: likewise.
+        config: likewise.
     """
     y = jax.eval_shape(neutral_parameters, models[0].model)
     keep_structure(y)
@@ -59,7 +67,12 @@ def begin_compilation(
         if shadows is not None:
             calls.append((_program(shadows), (y, data, model, models[0], config)))
         calls.append((_program(fitting), (y, data, model, weights, config, jnp.asarray(level))))
-    return clock.begin(calls)
+    drop = clock.begin(calls)
+    try:
+        yield
+    except BaseException:
+        drop()
+        raise
 
 
 def fit_levels(
@@ -69,12 +82,11 @@ def fit_levels(
     weights: FitWeights,
     config: FitConfig,
 ) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
-    """``fit_parameters``, a program a stage, so that they compile side by side.
+    """``fit_parameters``, a program a stage: those of ``compiling_levels``, which comes first.
 
     Returns:
         Parameters, history, and the models with the shadows that they were fitted with.
     """
-    begin_compilation(clock, data, models, weights, config)
 
     def call(stage: Callable[..., Any], *args: Any) -> Any:
         return clock.run("fit", _program(stage), *args)

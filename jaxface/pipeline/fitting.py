@@ -22,7 +22,7 @@ from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
 from jaxface.models.subdivide import subdivide
 from jaxface.pipeline.clock import Clock
-from jaxface.pipeline.fit_levels import begin_compilation, fit_levels
+from jaxface.pipeline.fit_levels import compiling_levels, fit_levels
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
@@ -290,32 +290,26 @@ def fit(
         steps=tuple(steps), extra_terms=tuple(extra_terms), shadow_directions=shadow_directions
     )
 
-    def prepared(count: int) -> tuple[FitModel, ...]:
-        return clock.host("prepare model", detail_levels, model, count, len(steps), details)
-
     if landmarks is None:
         count = 68 if model.landmarks468 is None else 468
-        models = prepared(count)
-        # The programs take longest: they are compiled while the detector looks.
-        drop = begin_compilation(clock, input_shapes(size, count), models, weights, config)
-        try:
-            found = clock.host("detect landmarks", detector, seen.pixels, face)
-        except BaseException:
-            drop()
-            raise
-        landmarks = np.asarray(found.landmarks)[:, :2]
-        if model.landmarks468 is None:
-            landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
     else:
-        models = prepared(len(landmarks))
-    landmarks = np.asarray(landmarks, np.float64)[:, :2]
-    linear = np.asarray(srgb_to_linear(jnp.asarray(seen.pixels)))
-    focal = None
-    if seen.focal_35mm:
-        focal = seen.focal_35mm / 36.0 * max(linear.shape[:2])
-    working = clock.host(
-        "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
-    )
+        count = len(landmarks)
+    models = clock.host("prepare model", detail_levels, model, count, len(steps), details)
+    # The programs take longest: they are compiled while the detector looks.
+    with compiling_levels(clock, input_shapes(size, count), models, weights, config):
+        if landmarks is None:
+            found = clock.host("detect landmarks", detector, seen.pixels, face)
+            landmarks = np.asarray(found.landmarks)[:, :2]
+            if model.landmarks468 is None:
+                landmarks = np.asarray(landmarks68(jnp.asarray(landmarks, jnp.float32)))
+        landmarks = np.asarray(landmarks, np.float64)[:, :2]
+        linear = np.asarray(srgb_to_linear(jnp.asarray(seen.pixels)))
+        focal = None
+        if seen.focal_35mm:
+            focal = seen.focal_35mm / 36.0 * max(linear.shape[:2])
+        working = clock.host(
+            "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
+        )
     parameters, stats, models = fit_levels(clock, working.data, models, weights, config)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")

@@ -94,10 +94,9 @@ def _write_meshes(folder: Path, fitted: FittedFace, textured: Texture | None) ->
     rest = np.asarray(model.mean + model.identity(y.identity))
     basis = np.asarray(model.expression.basis)
     deviations = np.asarray(model.expression.std)
-    expression = np.asarray(y.expression) * deviations
     names = model.expression_names or tuple(f"expression{k:02d}" for k in range(basis.shape[-1]))
     morphs = {n: basis[..., k] / deviations[k] for k, n in enumerate(names)}
-    standing = dict(zip(names, expression.tolist(), strict=True))
+    standing = dict(zip(names, _expression_weights(fitted), strict=True))
     data = fitted.working.data
     picture = (folder / "texture.png").read_bytes() if textured is not None else None
     write_glb(
@@ -115,6 +114,12 @@ def _write_meshes(folder: Path, fitted: FittedFace, textured: Texture | None) ->
         licence=model.licence,
         extras={"model": model.name, "principal": np.asarray(data.principal).tolist()},
     )
+
+
+def _expression_weights(fitted: FittedFace) -> list[float]:
+    """The fitted expression in the units of the model's own shapes."""
+    deviations = np.asarray(fitted.model.expression.std)
+    return (np.asarray(fitted.parameters.expression) * deviations).tolist()
 
 
 def _write_arrays(folder: Path, fitted: FittedFace, textured: Texture | None) -> None:
@@ -143,7 +148,7 @@ def _write_arrays(folder: Path, fitted: FittedFace, textured: Texture | None) ->
         "coefficients": "standard deviations",
         "energies": {name: values[-1] for name, values in histories(fitted)[-1]["terms"].items()},
         "expression_names": list(fitted.model.expression_names),
-        "expression_weights": np.asarray(y.expression * fitted.model.expression.std).tolist(),
+        "expression_weights": _expression_weights(fitted),
     }
     write_fit(folder / "fit.npz", y, arrays, metadata)
 
