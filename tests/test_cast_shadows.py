@@ -87,8 +87,8 @@ def photo():
         jnp.asarray(image, jnp.float32), jnp.ones((SIZE, SIZE)), jnp.zeros((12, 2)), jnp.ones(12),
         jnp.asarray(0.3), principal, y.log_focal, jnp.asarray(0.1), jnp.asarray(False),
     )  # fmt: skip
-    found, transfer = jax.jit(cast_shadows)(y, data.image, data.mask, data, prepared, model)
-    return model, y, prepared, data, found, transfer, fragments
+    found, *cast = jax.jit(cast_shadows)(y, data.image, data.mask, data, prepared, model)
+    return model, y, prepared, data, found, cast, fragments
 
 
 def shading_at_ground(model, transfer, y):
@@ -98,7 +98,7 @@ def shading_at_ground(model, transfer, y):
 
 
 def test_the_shadow_lies_where_the_lamp_casts_it(photo):
-    model, y, _, _, found, transfer, _ = photo
+    model, y, _, _, found, (transfer, _), _ = photo
     ground = np.asarray(model.mean)[: SIDE**2]
     truth = true_shading(ground)
     shading = shading_at_ground(model, transfer, found).mean(axis=1)
@@ -112,15 +112,39 @@ def test_the_shadow_lies_where_the_lamp_casts_it(photo):
 
 
 def test_nine_harmonics_alone_do_not_hold_it(photo):
-    model, y, _, _, found, transfer, _ = photo
+    model, y, _, _, found, (transfer, _), _ = photo
     truth = true_shading(np.asarray(model.mean)[: SIDE**2])
     hard = np.abs(shading_at_ground(model, transfer, found).mean(axis=1) - truth).mean()
     soft = np.abs(shading_at_ground(model, model.occlusion, found).mean(axis=1) - truth).mean()
     assert hard < 0.6 * soft
 
 
+def test_ground_in_shadow_does_not_get_brighter_by_turning_to_the_lamp(photo):
+    model, y, _, _, found, (transfer, slope), _ = photo
+    shadowed = dataclasses.replace(model, occlusion=transfer, occlusion_slope=slope)
+    normals = vertex_normals(model.mean, model.faces)
+    # At the normals of the shape itself the slope adds nothing.
+    np.testing.assert_allclose(shadowed.occlusion_of(normals), transfer, atol=1e-5)
+    towards = normals + 0.2 * jnp.asarray(LAMP - LAMP[2] * np.array([0, 0, 1.0]), jnp.float32)
+    towards = towards / jnp.linalg.norm(towards, axis=1, keepdims=True)
+
+    def shading(model):
+        hidden = hidden_shading(model.occlusion_of(towards), jnp.eye(3), found.light)
+        return np.asarray(irradiance(towards, found.light) + hidden).mean(axis=1)
+
+    change = shading(shadowed) - shading(dataclasses.replace(shadowed, occlusion_slope=None))
+    place = np.asarray(model.mean)
+    ground = (np.abs(place) < 60).all(axis=1) & (np.arange(len(place)) < SIDE**2)
+    deep = ground & (np.abs(place[:, 0] + 15) < 8) & (np.abs(place[:, 1]) < 35)
+    # What the lamp would have added is taken away again; where it shines, the board hides only
+    # some of the even light.
+    gained = KEY * float(np.mean((towards - normals)[deep] @ LAMP))
+    assert np.mean(change[deep]) == pytest.approx(-gained, rel=0.15)
+    assert np.mean(np.abs(change[ground & (place[:, 0] > 30)])) < 0.15 * gained
+
+
 def test_pixels_in_shadow_are_trusted_less(photo):
-    model, _, prepared, data, found, transfer, fragments = photo
+    model, _, prepared, data, found, (transfer, _), fragments = photo
     shadowed = dataclasses.replace(model, occlusion=transfer)
     samples = sample_pixels(
         data.image, data.mask, fragments.triangle, model.faces, prepared.face_mask,
@@ -139,8 +163,8 @@ def test_pixels_in_shadow_are_trusted_less(photo):
 def test_no_gradient_passes_and_nothing_is_nan_in_the_dark(photo):
     model, y, prepared, data, *_ = photo
     black = jnp.zeros_like(data.image)
-    found, transfer = cast_shadows(y, black, data.mask, data, prepared, model, directions=32)
-    assert np.isfinite(np.asarray(found.light)).all() and np.isfinite(np.asarray(transfer)).all()
+    dark = cast_shadows(y, black, data.mask, data, prepared, model, directions=32)
+    assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(dark))
     nothing = cast_shadows(y, data.image, 0 * data.mask, data, prepared, model, directions=32)
     assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(nothing))
 

@@ -142,14 +142,15 @@ def test_albedo_is_freed_of_the_shadows_that_the_fit_saw(case):
         y, stats = jax.jit(fit_parameters)(photo, problem.models, fit_weights, config)
         found = jax.jit(infer_texture)(photo, fit_weights, weights, problem, config)
 
-        def freed(occlusion):
-            model = shadowed.with_occlusion(occlusion).model
+        def freed(*occlusion):
+            model = shadowed.with_occlusion(*occlusion).model
             shape = y.pose(model.shape(y.identity, y.expression))
             return unwrap(
                 photo.image, photo.mask, shape, model.faces, y.camera(photo.principal, SIZE),
                 y.light, problem.layout, fit_hidden_shading(y, model), tile=RESOLUTION,
             ).albedo  # fmt: skip
 
-        np.testing.assert_allclose(found.partial.albedo, freed(stats.occlusion), atol=1e-9)
+        cast = freed(stats.occlusion, stats.occlusion_slope)
+        np.testing.assert_allclose(found.partial.albedo, cast, atol=1e-9)
         soft = freed(shadowed.model.occlusion)
         assert float(jnp.max(jnp.abs(found.partial.albedo - soft))) > 1e-3

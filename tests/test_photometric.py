@@ -38,7 +38,10 @@ def double_scene():
     with jax.enable_x64(True):
         model = small_model()
         shadow = np.random.default_rng(5).normal(size=(model.vertex_count, 9))
-        model = dataclasses.replace(model, occlusion=jnp.asarray(0.1 * shadow))
+        slope = np.random.default_rng(6).normal(size=(model.vertex_count, 3, 9))
+        model = dataclasses.replace(
+            model, occlusion=jnp.asarray(0.1 * shadow), occlusion_slope=jnp.asarray(0.3 * slope)
+        )
         y = small_parameters(model)
         samples = small_samples(model, y)
         stencil = normal_stencil(np.asarray(model.faces), model.vertex_count)

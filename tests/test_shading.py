@@ -14,6 +14,7 @@ from jaxface.render.shading import (
     irradiance_slope,
     light_from_radiance,
     sh_basis,
+    sh_basis_on_host,
 )
 
 
@@ -47,6 +48,14 @@ def test_basis_is_orthonormal_and_ordered():
             0.546274 * (x * x - y * y),
         ]
         np.testing.assert_allclose(sh_basis(jnp.asarray(n)), expected, atol=1e-6)
+
+
+def test_basis_on_the_host_is_the_same(x64):
+    normals = np.random.default_rng(3).normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        sh_basis_on_host(normals), sh_basis(jnp.asarray(normals)), atol=1e-14
+    )
 
 
 def test_radiance_becomes_the_clamped_cosine_integral():

@@ -128,7 +128,7 @@ def synthesize(
     albedo = jnp.einsum("pi,pij->pj", weights, model.reflectance(y.albedo)[used])
     shading = irradiance(normal, y.light)
     if model.occlusion is not None:
-        hidden = hidden_shading(model.occlusion, rotation, y.light)
+        hidden = hidden_shading(model.occlusion_of(normals), rotation, y.light)
         shading = shading + jnp.einsum("pi,pij->pj", weights, hidden[used])
     return albedo * shading
 

@@ -9,7 +9,8 @@ with the weights held, the ray slides over the triangle by
 ``dc = (s grad a + D grad m) tau + D sum_i b_i dn_i``,  ``D = a * L^T H'(n) (I - n n^T)/|m|``.
 
 The shading hidden by the face itself, where the model knows it, is one more interpolated
-per-vertex colour in ``s``, linear in the light and turned with the head.
+per-vertex colour in ``s``, linear in the light, turned with the head, and where the model knows
+that too linear in the vertex normals, to whose modes it adds ``a sum_i b_i dh_i/dn_i dn_i``.
 
 Every geometric unknown enters by ``u`` and ``sum b_i dn_i`` alone: both are interpolated rows of
 bases, and the camera's own motion is written down directly. Forward autodiff of the same
@@ -98,9 +99,10 @@ def photometric_jacobian(
     m_norm = jnp.maximum(jnp.sqrt(jnp.sum(m * m, axis=-1, keepdims=True)), 1e-12)
     n = m / m_norm
     shading = irradiance(n, y.light)
-    hidden = None
+    hidden, occlusion = None, None
     if model.occlusion is not None:
-        hidden = hidden_shading(model.occlusion, rotation, y.light)
+        occlusion = model.occlusion_of(unit)
+        hidden = hidden_shading(occlusion, rotation, y.light)
         shading = shading + _interpolate(b, hidden, tri)
 
     # D: colour change for a change of the interpolated normal m.
@@ -142,12 +144,18 @@ def photometric_jacobian(
 
     j_albedo = shading[:, :, None] * _interpolate(b, model.albedo.basis, tri)
     harmonics = sh_basis(n)
-    if model.occlusion is not None:
+    if occlusion is not None:
         turn = sh_rotation(rotation)
-        harmonics = harmonics + _interpolate(b, model.occlusion @ turn.T, tri)
+        harmonics = harmonics + _interpolate(b, occlusion @ turn.T, tri)
         turned_light = jax.jacfwd(lambda w: sh_rotation(rotation_matrix(w)).T @ y.light)(y.rotation)
-        unlit = _interpolate(b, model.occlusion, tri)
+        unlit = _interpolate(b, occlusion, tri)
         j_rotation = j_rotation + a[:, :, None] * jnp.einsum("pk,kcw->pcw", unlit, turned_light)
+    if model.occlusion_slope is not None:
+        turning = jnp.swapaxes(hidden_shading(model.occlusion_slope, rotation, y.light), 1, 2)
+        for corner in range(3):
+            at = tri[:, corner]
+            by_corner = (b[:, corner, None] * a)[:, :, None] * turning[at]
+            j_shape = j_shape + by_corner @ normal_modes[at]
     eye = jnp.eye(3, dtype=n.dtype)
     j_light = jnp.einsum("pc,pj,cd->pcjd", a, harmonics, eye).reshape(*a.shape, 27)
     jacobian = jnp.concatenate([j_shape, j_albedo, j_light, j_rotation, slope, j_focal], axis=-1)

@@ -51,6 +51,8 @@ class MorphableModel(eqx.Module):
     uv_quads: Int[Array, "q 4"] | None = None
     occlusion: Float[Array, "n 9"] | None = None
     """shading lost to self-occlusion (``render.occlusion``), of the mean face; None: no shadows"""
+    occlusion_slope: Float[Array, "n 3 9"] | None = None
+    """change of ``occlusion`` with each component of the vertex's unit normal, along the surface"""
 
     @property
     def vertex_count(self) -> int:
@@ -66,6 +68,18 @@ class MorphableModel(eqx.Module):
     def reflectance(self, albedo: Float[Array, "a"]) -> Float[Array, "n 3"]:
         """Per-vertex albedo I (linear RGB) for coefficients in standard deviations."""
         return self.albedo_mean + self.albedo(albedo)
+
+    def occlusion_of(self, normals: Float[Array, "n 3"]) -> Float[Array, "n 9"]:
+        """Shading lost to self-occlusion by vertices of given unit normals (model frame).
+
+        To first order about the shape that ``occlusion`` and ``occlusion_slope`` are of: slopes
+        lie in that one's tangent planes, so they add nothing there. Zero without ``occlusion``.
+        """
+        if self.occlusion is None:
+            return jnp.zeros((self.vertex_count, 9), normals.dtype)
+        if self.occlusion_slope is None:
+            return self.occlusion
+        return self.occlusion + jnp.einsum("nj,njk->nk", normals, self.occlusion_slope)
 
     def region_mask(self, *names: str) -> Array:
         """True at the vertices of the named regions.

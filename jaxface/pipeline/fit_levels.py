@@ -62,10 +62,13 @@ def compiling_levels(
     calls: list[tuple[KeptProgram, tuple[Any, ...]]] = [
         (_program(fit_start), (data, models[0], weights, config))
     ]
-    stages = level_stages(data, models, config)
+    stages, cast = level_stages(data, models, config), False
     for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
         if shadows is not None:
             calls.append((_program(shadows), (y, data, model, models[0], config)))
+            cast = True
+        if cast:
+            model = _with_cast_shadows(model)
         calls.append((_program(fitting), (y, data, model, weights, config, jnp.asarray(level))))
     drop = clock.begin(calls)
     try:
@@ -73,6 +76,16 @@ def compiling_levels(
     except BaseException:
         drop()
         raise
+
+
+def _with_cast_shadows(model: FitModel) -> FitModel:
+    """A model with shapes in place of what ``fit_shadows`` gives for it."""
+    mean = model.model.mean
+
+    def nothing() -> tuple[Any, Any]:
+        return jnp.zeros((len(mean), 9), mean.dtype), jnp.zeros((len(mean), 3, 9), mean.dtype)
+
+    return model.with_occlusion(*jax.eval_shape(nothing))
 
 
 def fit_levels(

@@ -18,7 +18,7 @@ from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.render.rasterize import rasterize
-from jaxface.render.shading import BAND, sh_basis
+from jaxface.render.shading import BAND, sh_basis, sh_basis_on_host
 
 _LOBE = np.array([(1.0, 2.0 / 3.0, 0.25)[band] for band in BAND])
 
@@ -94,7 +94,9 @@ def hidden_directions(
     """
     points, normals, vertices = jax.lax.stop_gradient((points, normals, vertices))
     hidden = _hidden_from(points, normals, vertices, faces, size, offset)
-    return jax.lax.map(lambda view: hidden(*view), _views(directions, vertices.dtype)).T
+    views = _views(directions, vertices.dtype)
+    # Some at a time: depth maps are so small that one alone is mostly the loop's own cost.
+    return jax.lax.map(lambda view: hidden(*view), views, batch_size=8).T
 
 
 def _views(directions: np.ndarray, dtype: Any) -> tuple[Array, Array]:
@@ -141,18 +143,18 @@ def sh_rotation(rotation: Float[Array, "3 3"]) -> Float[Array, "9 9"]:
     From nine fixed directions whose harmonics are independent (condition number 3).
     """
     points = sphere_lattice(9)
-    inverse = np.linalg.inv(np.asarray(_host_basis(points)))
+    inverse = np.linalg.inv(sh_basis_on_host(points))
     turned = sh_basis(jnp.asarray(points, rotation.dtype) @ rotation.T)
     return (jnp.asarray(inverse, rotation.dtype) @ turned).T
 
 
 def hidden_shading(
-    occlusion: Float[Array, "n 9"], rotation: Float[Array, "3 3"], light: Float[Array, "9 3"]
-) -> Float[Array, "n 3"]:
+    occlusion: Float[Array, "*n 9"], rotation: Float[Array, "3 3"], light: Float[Array, "9 3"]
+) -> Float[Array, "*n 3"]:
     """Shading (negative) that self-occlusion adds to ``H(n) L`` at each vertex.
 
     Args:
-        occlusion: in the mesh's frame, from ``self_occlusion``.
+        occlusion: in the mesh's frame, from ``self_occlusion``; or its slopes.
         rotation: from the mesh's frame to the light's.
         light: shading coefficients in their own frame.
     """
@@ -166,11 +168,6 @@ def sphere_lattice(count: int) -> Float[np.ndarray, "m 3"]:
     angle = index * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z * z)
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-
-
-def _host_basis(points: np.ndarray) -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(sh_basis(jnp.asarray(points)), np.float64)
 
 
 def _frames(directions: np.ndarray) -> np.ndarray:

@@ -55,6 +55,12 @@ def sh_basis(normals: Float[Array, "*batch 3"]) -> Float[Array, "*batch 9"]:
     return _forms_at(normals, forms)
 
 
+def sh_basis_on_host(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 9"]:
+    """``sh_basis`` in NumPy and double precision, for tables that are made while tracing."""
+    points = np.concatenate([normals, np.ones((len(normals), 1))], axis=1)
+    return np.einsum("ni,kij,nj->nk", points, _FORMS, points)
+
+
 def _forms_at(
     normals: Float[Array, "*batch 3"], forms: Float[Array, "k 4 4"]
 ) -> Float[Array, "*batch k"]:

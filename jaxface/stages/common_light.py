@@ -74,7 +74,8 @@ def lit_vertices(
     size = image.shape[0]
     shape = model.shape(y.identity, y.expression)
     rotation = rotation_matrix(y.rotation)
-    normal = vertex_normals(shape, model.faces) @ rotation.T
+    unturned = vertex_normals(shape, model.faces)
+    normal = unturned @ rotation.T
     posed = y.pose(shape)
     cosine = -jnp.sum(normal * posed, axis=-1) / safe_norm(posed)
     camera = y.camera(principal, size)
@@ -85,7 +86,7 @@ def lit_vertices(
     weight = smoothstep(cosine, 0.2, 0.6) * seen[:, 3] * inside * buffer.unoccluded(posed, normal)
     harmonics = sh_basis(normal)
     if model.occlusion is not None:
-        harmonics = harmonics + model.occlusion @ sh_rotation(rotation).T
+        harmonics = harmonics + model.occlusion_of(unturned) @ sh_rotation(rotation).T
     return LitVertices(seen[:, :3], harmonics, weight)
 
 

@@ -208,7 +208,9 @@ def _candidates(
 def _landmarks(
     nets: LandmarkNetworks, photo: PhotoPyramid, box: np.ndarray, keypoints: np.ndarray
 ) -> DetectedFace:
-    region = _first_region(*(jnp.asarray(x, jnp.float32) for x in (box, *keypoints[:2])))
+    region = _first_region(*(np.asarray(x, np.float32) for x in (box, *keypoints[:2])))
+    # In NumPy from here: every operation of JAX's own would be compiled for itself.
+    region = jax.tree.map(np.asarray, region)
     centre = (float(region.centre[0]), float(region.centre[1]))
     patch, corner, factor = photo.patch(centre, _REACH * float(region.side), _PATCH_SIZE)
     image = _channels_last(patch)
@@ -234,15 +236,18 @@ def _settle(
 ) -> tuple[np.ndarray, float, Region]:
     # Look until the region that the points give is the one they were found in. A detection's
     # region is rough, so the first look never counts. Then average over a few sizes of it.
-    _, _, region = _look(mesh, image, region)
+    def look(region: Region) -> tuple[np.ndarray, np.ndarray, Region]:
+        return jax.tree.map(np.asarray, _look(mesh, image, region))
+
+    _, _, region = look(region)
     for _ in range(_MAX_LOOKS - 1):
         before = region
-        points, presence, region = _look(mesh, image, before)
-        shift = np.max(np.abs(np.asarray(region.centre) - np.asarray(before.centre)))
+        points, presence, region = look(before)
+        shift = np.max(np.abs(region.centre - before.centre))
         if max(shift, abs(region.side - before.side)) < _STILL * region.side:
             break
     others = [
-        _look(mesh, image, Region(before.centre, before.side * np.float32(k), before.angle))[0]
+        look(Region(before.centre, before.side * np.float32(k), before.angle))[0]
         for k in _OTHER_SIZES
     ]
     return np.mean([points, *others], axis=0), float(presence), region

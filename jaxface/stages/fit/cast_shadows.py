@@ -4,7 +4,8 @@ Nine harmonics hold no lamp, so the self-occlusion of ``render.occlusion`` makes
 Between the pyramid's levels the light is therefore estimated once more, as non-negative radiance
 from many directions, each with the shadow that the present shape casts in it (Sato, Sato & Ikeuchi,
 "Illumination from shadows", IEEE TPAMI 2003). What that light loses in the shadows replaces the
-transfer of self-occlusion; the fit itself goes on with its nine harmonics.
+transfer of self-occlusion; the fit itself goes on with its nine harmonics. With the transfer comes
+its slope in the normals: what lies in shadow does not get brighter by turning to the light.
 """
 
 import equinox as eqx
@@ -56,8 +57,8 @@ def cast_shadows(
     directions: int = 256,
     pixels: int = 3000,
     rounds: int = 4,
-) -> tuple[FaceParameters, Float[Array, "n 9"]]:
-    """The light estimated anew with hard shadows: ``y`` with it, and the transfer it comes with.
+) -> tuple[FaceParameters, Float[Array, "n 9"], Float[Array, "n 3 9"]]:
+    """The light estimated anew with hard shadows: ``y`` with it, the transfer, and its slope.
 
     Over the visible face pixels p with albedo a, radiance ``E_j >= 0`` of the directions ``w_j`` of
     a lattice minimises the unsquared norm of the colour difference,
@@ -68,7 +69,9 @@ def cast_shadows(
     non-negative least squares. With the shading ``h_i = -(4 / m) sum_j (1 - v_ij) max(n_i . w_j, 0)
     E_j`` that a vertex loses, the nine coefficients ``L`` are found again by linear least squares,
     and the transfer ``o`` of self-occlusion becomes the nearest one with ``o_i L = h_i``: it
-    follows light and head in the steps to come, as the soft one does.
+    follows light and head in the steps to come, as the soft one does. Its slope O in the normal is
+    likewise the nearest one with ``O_i L = dh_i/dn_i = -(4 / m) sum_j (1 - v_ij) w_j E_j`` over the
+    directions before the tangent plane, less what is along ``n_i``.
 
     No gradient passes.
 
@@ -127,15 +130,23 @@ def cast_shadows(
     start = jnp.ones((len(towards), 3), shape.dtype)
     radiance, _ = jax.lax.scan(reweighted, start, None, length=rounds)
 
-    lost = jnp.maximum(normals @ lattice.T, 0.0) * hidden
-    loss = smooth_over_mesh(-(4.0 / directions) * lost @ radiance, face.faces, SMOOTHING)
+    taken = (hidden & (normals @ lattice.T > 0)).astype(shape.dtype)
+    moments = (lattice[:, :, None] * radiance[:, None, :]).reshape(-1, 9)
+    bare = -(4.0 / directions) * (taken @ moments).reshape(-1, 3, 3)
+    both = jnp.concatenate([jnp.sum(normals[:, :, None] * bare, 1), bare.reshape(-1, 9)], axis=1)
+    # Each smoothed for itself: vectors of neighbours that face elsewhere would give light.
+    both = smooth_over_mesh(both, face.faces, SMOOTHING)
+    loss, turning = both[:, :3], both[:, 3:].reshape(-1, 3, 3)
+    along = jnp.sum(normals[:, :, None] * turning, axis=1, keepdims=True)
+    turning = rotation.T @ (turning - normals[:, :, None] * along)
     light = _harmonics(y.light, samples, normal, albedo, at_pixels(loss), albedo * (lit @ radiance))
     turned_light = sh_rotation(rotation).T @ light
     square = turned_light.T @ turned_light
     square = square + (1e-4 * jnp.trace(square) + 1e-9) * jnp.eye(3, dtype=square.dtype)
-    missing = loss - soft @ turned_light
-    transfer = soft + missing @ jnp.linalg.solve(square, turned_light.T)
-    return eqx.tree_at(lambda p: p.light, y, light), jax.lax.stop_gradient(transfer)
+    back = jnp.linalg.solve(square, turned_light.T)
+    transfer = soft + (loss - soft @ turned_light) @ back
+    y = eqx.tree_at(lambda p: p.light, y, light)
+    return y, *jax.lax.stop_gradient((transfer, turning @ back))
 
 
 def shadow_trust(
@@ -156,9 +167,9 @@ def shadow_trust(
     if model.occlusion is None:
         return jnp.ones_like(samples.weight)
     rotation = rotation_matrix(y.rotation)
-    normals = vertex_normals(model.shape(y.identity, y.expression), model.faces) @ rotation.T
-    lost = -jnp.mean(hidden_shading(model.occlusion, rotation, y.light), axis=-1)
-    whole = jnp.mean(irradiance(normals, y.light), axis=-1)
+    normals = vertex_normals(model.shape(y.identity, y.expression), model.faces)
+    lost = -jnp.mean(hidden_shading(model.occlusion_of(normals), rotation, y.light), axis=-1)
+    whole = jnp.mean(irradiance(normals @ rotation.T, y.light), axis=-1)
     share = jnp.maximum(lost, 0.0) / jnp.maximum(whole, 1e-3)
     return 1.0 - smoothstep(jnp.mean(share[samples.triangle], axis=-1), *SHADOWED)
 

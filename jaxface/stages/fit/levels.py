@@ -54,17 +54,19 @@ def through_levels(
         Parameters, history, and the models with the shadows that they were fitted with.
     """
     y, record = call(fit_start, data, models[0], weights, config)
-    records, shadowed, occlusion = [record], [], None
+    records, shadowed, cast = [record], [], None
     stages = level_stages(data, models, config)
     for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
         if shadows is not None:
-            y, occlusion = call(shadows, y, data, model, models[0], config)
-        if occlusion is not None:
-            model = model.with_occlusion(occlusion)
+            y, *cast = call(shadows, y, data, model, models[0], config)
+        if cast is not None:
+            model = model.with_occlusion(*cast)
         y, record = call(fitting, y, data, model, weights, config, jnp.asarray(level))
         records.append(record)
         shadowed.append(model)
-    return y, join_records(records, shadowed[-1].model.occlusion), tuple(shadowed)
+    finest = shadowed[-1].model
+    stats = join_records(records, finest.occlusion, finest.occlusion_slope)
+    return y, stats, tuple(shadowed)
 
 
 def level_stages(

@@ -33,10 +33,15 @@ class FitModel(eqx.Module):
     face_mask: Bool[Array, "f"]
     """triangles that the photo term compares"""
 
-    def with_occlusion(self, occlusion: Float[Array, "n 9"]) -> "FitModel":
-        """The same with another transfer of self-occlusion."""
+    def with_occlusion(
+        self, occlusion: Float[Array, "n 9"], slope: Float[Array, "n 3 9"] | None = None
+    ) -> "FitModel":
+        """The same with another transfer of self-occlusion, and its slope in the normals."""
         return eqx.tree_at(
-            lambda m: m.model.occlusion, self, occlusion, is_leaf=lambda x: x is None
+            lambda m: (m.model.occlusion, m.model.occlusion_slope),
+            self,
+            (occlusion, slope),
+            is_leaf=lambda x: x is None,
         )
 
 

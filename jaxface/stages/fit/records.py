@@ -95,6 +95,8 @@ class FitStats(eqx.Module):
     """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
     occlusion: Float[Array, "n 9"] | None = None
     """transfer of self-occlusion that the finest level was fitted with"""
+    occlusion_slope: Float[Array, "n 3 9"] | None = None
+    """its slope in the vertex normals"""
 
 
 class LevelRecord(eqx.Module):
@@ -106,7 +108,9 @@ class LevelRecord(eqx.Module):
 
 
 def join_records(
-    records: Sequence[LevelRecord], occlusion: Float[Array, "n 9"] | None = None
+    records: Sequence[LevelRecord],
+    occlusion: Float[Array, "n 9"] | None = None,
+    occlusion_slope: Float[Array, "n 3 9"] | None = None,
 ) -> FitStats:
     """The history of a fit from those of its levels, the landmark-only start first."""
     return FitStats(
@@ -114,4 +118,5 @@ def join_records(
         tuple(r.steps for r in records),
         records[-1].curvature,
         occlusion,
+        occlusion_slope,
     )

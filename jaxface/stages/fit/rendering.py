@@ -58,7 +58,8 @@ def fit_hidden_shading(y: FaceParameters, model: MorphableModel) -> Float[Array,
     """Shading (negative) that the face's own parts take from each vertex under the fitted light."""
     if model.occlusion is None:
         return jnp.zeros((model.vertex_count, 3), y.light.dtype)
-    return hidden_shading(model.occlusion, rotation_matrix(y.rotation), y.light)
+    normals = vertex_normals(model.shape(y.identity, y.expression), model.faces)
+    return hidden_shading(model.occlusion_of(normals), rotation_matrix(y.rotation), y.light)
 
 
 def skin_map(

@@ -114,8 +114,8 @@ def fit_shadows(
     config: FitConfig,
     *,
     level: int,
-) -> tuple[FaceParameters, Float[Array, "n 9"]]:
-    """Light, and the transfer of its cast shadows, from the fit of the level before."""
+) -> tuple[FaceParameters, Float[Array, "n 9"], Float[Array, "n 3 9"]]:
+    """Light, the transfer of its cast shadows, and its slope, from the fit of the level before."""
     image, mask, _ = level_image(data, len(config.steps), level, level_side(data, config, level))
     return cast_shadows(
         y, image, mask, data, model, coarsest.model, directions=config.shadow_directions
