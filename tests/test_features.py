@@ -84,6 +84,17 @@ def test_gate_and_adjoints(x64):
         assert float(jnp.vdot(adjoint, x)) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("tiles", [4, 1000])
+def test_a_pixel_that_is_not_a_number_gives_no_wrong_number(tiles):
+    rng = np.random.default_rng(3)
+    x, kernel = rng.normal(size=(12, 16, 3)), rng.normal(size=(3, 3, 3, 2))
+    x[0, 0, 0] = np.nan  # the pixel that the zero unknown to XLA is made of
+    y = np.asarray(winograd_conv3x3(jnp.asarray(x), jnp.asarray(kernel), tiles_at_once=tiles))
+    assert np.isnan(y[:2, :2]).all()
+    plain = np.asarray(direct_conv3x3(jnp.asarray(x), jnp.asarray(kernel)))
+    assert (np.isnan(y) | np.isclose(y, plain, atol=1e-4)).all()
+
+
 def test_error_of_winograd_in_single_precision():
     x = numbers(0, 40, 40, 64).astype(jnp.float32)
     kernel = numbers(1, 3, 3, 64, 64).astype(jnp.float32)

@@ -23,12 +23,12 @@ from jaxface.models.winograd import winograd_conv3x3
 METHODS = ("auto", "winograd", "direct")
 """``auto``: on CPUs wide layers by Winograd, the first by shifted sums; direct elsewhere"""
 
-_NARROW, _WIDE, _WIDE_AVX512 = 2, 64, 256
+_NARROW, _WIDE, _WIDE_AVX512 = 2, 64, 128
 """on CPUs ``auto`` means shifted sums up to the first, Winograd from the second number of channels
 or, where products are twice as fast, the third; the fewer channels, the more of Winograd's time are
-its transforms, on one core"""
+its transforms"""
 
-_LARGE = 2048
+_LARGE = 1024
 """pixels of an image from which on Winograd pays for the transform of the kernel"""
 
 

@@ -4,16 +4,18 @@ Lavin and Gray, "Fast Algorithms for Convolutional Neural Networks", CVPR 2016: 
 into tiles of 4x4 outputs; input tiles (6x6) and kernels go through small linear maps, after which
 the convolution is 36 matrix products, with a quarter of the multiplications of the direct sum.
 
-Strips of tile rows are processed one after another, so that the transformed tiles stay in cache.
-XLA turns the transforms into vector code only if it is given no reason not to:
+Strips of tile rows are processed one after another, so that memory is bounded. XLA turns the
+transforms into vector code for all cores only if it is given no reason not to:
 
 - a slice at a place known at run time is fused into its readers, whose inner loops then load the
-  place anew for every element; so the strip is carried through the loop, and its successor is
-  sliced at the end of each step;
+  place anew for every element;
 - a concatenation becomes a branch for every element; so each map writes a new axis by
   broadcasting against columns of its matrix, which costs multiplications by zero and saves code;
-- a map fused into the next is recomputed by every reader; so maps along the two axes are kept
-  apart by writing to a carried buffer, at a place that only we know to be zero.
+- a map fused into the next is recomputed by every reader; and one fused into the write to a part of
+  a larger array runs on a single core.
+
+So each map along one axis is the branch of a condition that only we know to be true: nothing is
+fused across it, and it is still shared among the cores.
 
 Kernels and buffers are computed from a zero that depends on the image: XLA would otherwise make
 those of all layers at the start of a program, and hold them.
@@ -21,13 +23,14 @@ those of all layers at the start of a program, and hold them.
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxface._types import Array, Bool, Float, Int
+from jaxface._types import Array, Bool, Float
 
 TILE = 4
 """outputs of a tile along each axis"""
@@ -64,9 +67,9 @@ _OUTPUT = np.array(
     ]
 )
 
-_TILES_AT_ONCE = 128
-"""tiles of a strip at most, as far as whole rows allow: the transformed tiles stay in a core's own
-cache, and a strip is still enough for an efficient matrix product"""
+_TILES_AT_ONCE = 1024
+"""tiles of a strip at most, as far as whole rows allow: enough work to be shared, and 36 * 1024
+floats a channel, before the matrix products and after them"""
 
 
 def winograd_conv3x3(
@@ -100,8 +103,8 @@ def winograd_conv3x3(
     rows = -(-rows // strips)  # of a strip
     step = rows * TILE
     size = (step + 2, columns * TILE + 2, channels)
-    # One row and column of zeros around; below also what the last load reads past the end.
-    margin = ((1, (strips + 1) * step + 1 - height), (1, size[1] - 1 - width), (0, 0))
+    # One row and column of zeros around, and what the last strip reads past the end.
+    margin = ((1, strips * step + 1 - height), (1, size[1] - 1 - width), (0, 0))
     padded = jnp.pad(x, margin)
     padded_gate = None if gate is None else jnp.pad(gate, margin)
     # Transposing the kernel itself would be fused into its transform, and read out of order there.
@@ -109,42 +112,39 @@ def winograd_conv3x3(
     transformed = _transform_kernel(kernel[::-1, ::-1] if transpose else kernel) + zero
     contracted = ((2,), (2 if transpose else 1,))
 
+    def apart(function: Callable[[Array], Array], value: Array) -> Array:
+        shape = jax.eval_shape(function, value)
+        # True of NaN as well.
+        return lax.cond(
+            ~(zero < -1), function, lambda _: jnp.zeros(shape.shape, shape.dtype), value
+        )
+
     def strip_at(i: Array | int) -> Array:
         strip = lax.dynamic_slice(padded, (i * step, 0, 0), size)
         if padded_gate is None:
             return strip
         return jnp.where(lax.dynamic_slice(padded_gate, (i * step, 0, 0), size), strip, 0)
 
-    def body(i: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        strip, along_y, half, out = carry
-        along_y = _written(along_y, _transform_rows(strip, rows), i)
-        tiles = _transform_columns(along_y[:_PATCH], columns)
+    def finish(half: Array) -> Array:
+        result = _inverse_columns(half)
+        return result if bias is None else jnp.maximum(result + bias, 0)
+
+    def convolved(strip: Array) -> Array:
+        along_y = apart(lambda strip: _transform_rows(strip, rows), strip)
+        tiles = _transform_columns(along_y, columns)
         products = lax.dot_general(tiles, transformed, (contracted, ((0,), (0,))))
         products = products.reshape(_PATCH, _PATCH, rows, columns, outputs)
-        half = _written(half, _inverse_rows(products), i)
-        result = _inverse_columns(half[:rows])
-        if bias is not None:
-            result = jnp.maximum(result + bias, 0)
-        out = lax.dynamic_update_slice(out, result[None], (i, 0, 0, 0, 0, 0))
-        return strip_at(i + 1), along_y, half, out
+        return apart(finish, apart(_inverse_rows, products))
 
-    def buffer(*shape: int) -> Array:
-        return jnp.full(shape, zero)
+    def body(i: Array, out: Array) -> Array:
+        return lax.dynamic_update_slice(out, convolved(strip_at(i))[None], (i, 0, 0, 0, 0, 0))
 
-    carry = (
-        strip_at(0),
-        buffer(_PATCH + 1, rows, *size[1:]),
-        buffer(rows + 1, TILE, _PATCH, columns, outputs),
-        buffer(strips, rows, TILE, columns, TILE, outputs),
-    )
-    out = lax.fori_loop(0, strips, body, carry)[-1]
+    if strips == 1:
+        out = convolved(strip_at(0))
+    else:
+        blank = jnp.full((strips, rows, TILE, columns, TILE, outputs), zero)
+        out = lax.fori_loop(0, strips, body, blank)
     return out.reshape(strips * step, columns * TILE, outputs)[:height, :width]
-
-
-def _written(buffer: Array, value: Array, step: Int[Array, ""]) -> Array:
-    """The buffer, one longer than the value along the first axis, with the value at its start."""
-    zero = jnp.minimum(step, 0)
-    return lax.dynamic_update_slice(buffer, value, (zero,) * value.ndim)
 
 
 def _column(matrix: np.ndarray, index: int, axis: int, ndim: int, like: Array) -> Array:
