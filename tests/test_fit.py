@@ -28,7 +28,7 @@ from jaxface.stages.fit import (
     working_photo,
 )
 from jaxface.stages.fit.inliers import inlier_weights
-from jaxface.stages.fit.solve import level_image, level_side
+from jaxface.stages.fit.solve import landmark_trust, level_image, level_side
 from jaxface.stages.fit.visible import visible_samples
 
 STEPS = (8, 3)
@@ -119,6 +119,21 @@ def test_energy_falls_within_every_level(fitted):
         assert total[-1] <= total[0]
         parts = sum(np.asarray(v)[: int(used) + 1] for k, v in history.items() if k != "total")
         np.testing.assert_allclose(parts, total, rtol=1e-4)
+
+
+def test_landmarks_of_a_turned_head_count_less(known):
+    def trust(degrees, power=4.0):
+        turned = dataclasses.replace(
+            known[0],
+            rotation=jnp.array([0.0, np.radians(degrees), 0.0]),
+            translation=jnp.array([0.0, 0.0, -700.0]),
+        )
+        return float(landmark_trust(turned, power))
+
+    assert trust(0) == trust(-15) == 1.0
+    assert trust(40) == pytest.approx(trust(-40)) == pytest.approx((0.766 / 0.94) ** 4, rel=1e-3)
+    assert trust(40, 0.0) == 1.0
+    assert 0.0 < trust(130) < 1e-3
 
 
 def test_posterior_shrinks_what_the_photo_shows(model, fitted):

@@ -23,6 +23,10 @@ class FitWeights(eqx.Module):
     landmark_scale: float | Array = 0.025
     """distance (of the eye distance) at which a landmark counts half, as an outlier does; 0
     gives the paper's plain squares"""
+    landmark_turn: float | Array = 4.0
+    """power of the cosine of the head's turn from the camera, over that of 20 degrees, with which
+    the landmark term counts beyond that: on renders the detector's error grows like this from 20 to
+    40 degrees; 0 gives the paper's constant weight"""
     focal: float | Array = 2.5e-5
     """of the prior on the focal length (not in the paper)"""
     light: float | Array = 2.5e-5
@@ -76,6 +80,8 @@ class FitData(eqx.Module):
     """``noise / E_c``: a Laplacian of unknown width has ``log E_c`` for its likelihood"""
     curvature_samples: PixelSamples
     landmark: LandmarkData
+    landmark_trust: Float[Array, ""]
+    """less than 1 where the head turns from the camera"""
     normal_modes: Float[Array, "n 3 k"]
     """derivative of the vertex normals along the shape modes, from the start of the level"""
     focal_prior: tuple[Array, Array]

@@ -52,6 +52,9 @@ from jaxface.stages.fit.records import (
 )
 from jaxface.stages.fit.visible import visible_samples
 
+TURNED = 0.94
+"""cosine of the head's turn from the camera (20 degrees) up to which landmarks count fully"""
+
 
 def fit_energy(weights: FitWeights | None = None, extra_terms: Sequence[Term] = ()) -> Energy:
     """Equation 1 of Saito 2017 as composed terms of ``(FaceParameters, FitData)``.
@@ -85,13 +88,14 @@ def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
 
 
 def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
+    def landmark(y: FaceParameters, d: FitData) -> Array:
+        return jnp.sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
+
     def focal(y: FaceParameters, d: FitData) -> Array:
         return focal_residual(y, d.focal_prior)
 
     return [
-        Term(
-            "landmark", lambda y, d: landmark_residual(y, d.landmark), _weight(weights, "landmark")
-        ),
+        Term("landmark", landmark, _weight(weights, "landmark")),
         Term("prior", lambda y, d: prior_residual(y), _weight(weights, "prior")),
         Term("focal", focal, _weight(weights, "focal")),
     ]
@@ -231,10 +235,21 @@ def observe(
         photo_trust=jnp.where(weights.noise > 0, trust, 1.0),
         curvature_samples=thin_samples(samples, config.curvature_pixels),
         landmark=eqx.tree_at(lambda d: d.weight, landmark, robust),
+        landmark_trust=landmark_trust(y, weights.landmark_turn),
         normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
         weights=weights,
     )
+
+
+def landmark_trust(y: FaceParameters, power: float | Float[Array, ""]) -> Float[Array, ""]:
+    """How much the landmark term counts, by the head's turn: 1 up to that of ``TURNED``.
+
+    On renders of known faces the detector's error is 1.4 times as large at 40 degrees as at 20.
+    """
+    to_camera = -y.translation / safe_norm(y.translation)
+    front = rotation_matrix(y.rotation)[:, 2] @ to_camera  # +z of the model comes out of the face
+    return jnp.clip(front / TURNED, 0.1, 1.0) ** power
 
 
 def landmark_data(data: FitInput, model: FitModel) -> LandmarkData:
@@ -271,6 +286,7 @@ def fit_landmarks(
         data, model, weights = args
         return _GeometricData(
             slide_contour(y, landmark_data(data, model), model.contour, model.outline),
+            jnp.ones((), y.light.dtype),
             (data.log_focal, data.log_focal_deviation),
             weights,
         )
@@ -284,6 +300,7 @@ def fit_landmarks(
 
 class _GeometricData(eqx.Module):
     landmark: LandmarkData
+    landmark_trust: Array
     focal_prior: tuple[Array, Array]
     weights: FitWeights
 
