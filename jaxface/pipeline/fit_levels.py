@@ -19,8 +19,7 @@ from jaxface.stages.fit import (
     FitStats,
     FitWeights,
     LevelRecord,
-    fit_start,
-    level_stages,
+    fit_shadows,
     through_levels,
 )
 
@@ -57,19 +56,19 @@ def compiling_levels(
         config: likewise.
     """
     y = jax.eval_shape(neutral_parameters, models[0].model)
+    record = LevelRecord({}, y.log_focal, y.identity)
     keep_structure(y)
-    keep_structure(LevelRecord({}, y.log_focal, y.identity))
-    calls: list[tuple[KeptProgram, tuple[Any, ...]]] = [
-        (_program(fit_start), (data, models[0], weights, config))
-    ]
-    stages, cast = level_stages(data, models, config), False
-    for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
-        if shadows is not None:
-            calls.append((_program(shadows), (y, data, model, models[0], config)))
-            cast = True
-        if cast:
-            model = _with_cast_shadows(model)
-        calls.append((_program(fitting), (y, data, model, weights, config, jnp.asarray(level))))
+    keep_structure(record)
+    calls: list[tuple[KeptProgram, tuple[Any, ...]]] = []
+
+    def call(stage: Callable[..., Any], *args: Any) -> Any:
+        # No more than shapes of the answer, and of records none that another stage would ask for.
+        calls.append((_program(stage), args))
+        if getattr(stage, "func", stage) is fit_shadows:
+            return y, *_cast_shapes(args[2])
+        return y, record
+
+    through_levels(data, models, weights, config, call)
     drop = clock.begin(calls)
     try:
         yield
@@ -78,14 +77,14 @@ def compiling_levels(
         raise
 
 
-def _with_cast_shadows(model: FitModel) -> FitModel:
-    """A model with shapes in place of what ``fit_shadows`` gives for it."""
+def _cast_shapes(model: FitModel) -> tuple[Any, Any]:
+    """Shapes of what ``fit_shadows`` gives for a model beside the parameters."""
     mean = model.model.mean
 
     def nothing() -> tuple[Any, Any]:
         return jnp.zeros((len(mean), 9), mean.dtype), jnp.zeros((len(mean), 3, 9), mean.dtype)
 
-    return model.with_occlusion(*jax.eval_shape(nothing))
+    return jax.eval_shape(nothing)
 
 
 def fit_levels(
