@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.pipeline.clock import Clock
+from jaxface.pipeline.clock import Clock, KeptProgram
 
 
 @pytest.fixture
@@ -63,3 +63,21 @@ def test_what_is_not_begun_can_be_dropped(counted, monkeypatch):
     gate.set()
     Clock().run("double", double, jnp.ones(4))
     assert len(count) == 1
+
+
+def test_a_kept_program_does_not_depend_on_where_its_arguments_lie(monkeypatch):
+    seen = []
+
+    class Jitted:
+        def lower(self, *leaves):
+            seen.append(leaves)
+            return self
+
+        def compile(self):
+            return lambda *leaves: leaves
+
+    monkeypatch.setattr("jaxface.pipeline.clock.kept_program", lambda name, function, *args: None)
+    monkeypatch.setattr("jaxface.pipeline.clock.jax.jit", lambda function, **how: Jitted())
+    program = KeptProgram("anything", lambda x, y: x)
+    assert Clock().run("anything", program, jnp.ones(3), 2.0)[1] == 2.0
+    assert seen == [(jax.ShapeDtypeStruct((3,), jnp.float32), 2.0)]

@@ -95,7 +95,12 @@ def _compile(program: Any, *args: PyTree) -> Any:
         kept_program(program.name, program.function, *args),
         compiler_options=program.compiler_options,
     )
-    compiled = flat.lower(*jax.tree.leaves(args)).compile()
+    # By shapes alone: where an array lies would be a part of the program, and of its cache's key.
+    shapes = [
+        jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.Array) else x
+        for x in jax.tree.leaves(args)
+    ]
+    compiled = flat.lower(*shapes).compile()
     return lambda *args: compiled(*jax.tree.leaves(args))
 
 
