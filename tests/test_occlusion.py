@@ -93,8 +93,11 @@ def test_a_finer_model_keeps_its_shadows(x64):
     model = small_model()
     normal = vertex_normals(model.mean, model.faces)
     shadow = 0.1 * sh_basis(normal)
-    finer = subdivide(dataclasses.replace(model, occlusion=shadow))
-    assert finer.occlusion is not None
+    slope = normal[:, :, None] * shadow[:, None, :]
+    finer = subdivide(dataclasses.replace(model, occlusion=shadow, occlusion_slope=slope))
+    assert finer.occlusion is not None and finer.occlusion_slope is not None
+    rows = subdivide(dataclasses.replace(model, occlusion=slope[:, 1])).occlusion
+    np.testing.assert_allclose(finer.occlusion_slope[:, 1], rows, atol=1e-12)
     assert finer.occlusion.shape == (finer.vertex_count, 9)
     light = ambient_light(1.0)
     np.testing.assert_allclose(finer.occlusion @ light, 0.1, rtol=1e-5)

@@ -150,7 +150,7 @@ def photometric_jacobian(
         turned_light = jax.jacfwd(lambda w: sh_rotation(rotation_matrix(w)).T @ y.light)(y.rotation)
         unlit = _interpolate(b, occlusion, tri)
         j_rotation = j_rotation + a[:, :, None] * jnp.einsum("pk,kcw->pcw", unlit, turned_light)
-    if model.occlusion_slope is not None:
+    if occlusion is not None and model.occlusion_slope is not None:
         turning = jnp.swapaxes(hidden_shading(model.occlusion_slope, rotation, y.light), 1, 2)
         for corner in range(3):
             at = tri[:, corner]

@@ -74,6 +74,9 @@ def _refine_once(model: MorphableModel) -> MorphableModel:
     }
     if model.occlusion is not None:
         changes["occlusion"] = jnp.asarray(apply(np.asarray(model.occlusion)))
+    if model.occlusion_slope is not None:
+        rows = np.asarray(model.occlusion_slope).reshape(-1, 27)
+        changes["occlusion_slope"] = jnp.asarray(apply(rows).reshape(-1, 3, 9))
     for name in ("landmarks68", "landmarks468"):
         points = getattr(model, name)
         if points is not None:

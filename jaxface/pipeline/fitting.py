@@ -148,7 +148,7 @@ def _render_program(size: int) -> Any:
 
 def _with_self_shadow(model: MorphableModel, wanted: bool) -> MorphableModel:
     if not wanted:
-        return dataclasses.replace(model, occlusion=None)
+        return dataclasses.replace(model, occlusion=None, occlusion_slope=None)
     if model.occlusion is not None:
         return model
     return dataclasses.replace(model, occlusion=self_occlusion(model.mean, model.faces))

@@ -1,5 +1,6 @@
 """A database of textures from a folder of photos, as Saito 2017 (section 6) made theirs."""
 
+import dataclasses
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -128,7 +129,7 @@ def build_database(
 
 def _with_occlusion(model: MorphableModel, wanted: bool) -> MorphableModel:
     known = self_occlusion(model.mean, model.faces) if wanted else None
-    return eqx.tree_at(lambda m: m.occlusion, model, known, is_leaf=lambda x: x is None)
+    return dataclasses.replace(model, occlusion=known, occlusion_slope=None)
 
 
 def subject_name(photo: str | os.PathLike[str]) -> str:

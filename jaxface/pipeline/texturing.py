@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxface._compilation import quick_jit
 from jaxface._types import Array, Float
 from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.pipeline.fitting import FittedFace
 from jaxface.stages.fit import fit_hidden_shading
 from jaxface.stages.low_frequency import low_frequency_albedo, over_low_frequency
 from jaxface.stages.unwrap import PartialAlbedo, unwrap
+
+_hidden_shading = quick_jit(fit_hidden_shading)
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
         "unwrap", lambda: jax.block_until_ready(unwrap(
             jnp.asarray(cut * fitted.working.gain), jnp.asarray(mask),
             y.pose(fitted.vertices), model.faces, camera, y.light, layout,
-            fit_hidden_shading(y, model),
+            _hidden_shading(y, model),
         )),
     )  # fmt: skip
     low = clock.host(
