@@ -97,6 +97,7 @@ def test_a_finer_model_keeps_its_shadows(x64):
     finer = subdivide(dataclasses.replace(model, occlusion=shadow, occlusion_slope=slope))
     assert finer.occlusion is not None and finer.occlusion_slope is not None
     rows = subdivide(dataclasses.replace(model, occlusion=slope[:, 1])).occlusion
+    assert rows is not None
     np.testing.assert_allclose(finer.occlusion_slope[:, 1], rows, atol=1e-12)
     assert finer.occlusion.shape == (finer.vertex_count, 9)
     light = ambient_light(1.0)
