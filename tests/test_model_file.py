@@ -112,6 +112,22 @@ def test_a_model_may_lack_modes_quads_and_landmarks(tmp_path, model):
     assert back.landmarks68 is None and back.quads is None
 
 
+def test_a_photos_shadows_are_written_with_their_slope(tmp_path, model):
+    rng = np.random.default_rng(1)
+    shadow, slope = rng.normal(size=(4, 9)), rng.normal(size=(4, 3, 9))
+    shaded = dataclasses.replace(
+        model, occlusion=jnp.asarray(shadow), occlusion_slope=jnp.asarray(slope)
+    )
+    save_model(tmp_path / "shaded.npz", shaded)
+    back = load_model(tmp_path / "shaded.npz")
+    assert back.occlusion is not None and back.occlusion_slope is not None
+    np.testing.assert_allclose(back.occlusion, shadow, rtol=1e-3)
+    np.testing.assert_allclose(back.occlusion_slope, slope, rtol=1e-3)
+    rewrite(tmp_path / "shaded.npz", occlusion_slope=slope[:3])
+    with pytest.raises(ValueError, match="occlusion_slope"):
+        load_model(tmp_path / "shaded.npz")
+
+
 def test_non_finite_models_are_not_written(tmp_path, model):
     path = tmp_path / "tetra.npz"
     save_model(path, model)

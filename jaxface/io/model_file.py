@@ -1,5 +1,6 @@
 """Morphable models in jaxface's own format: one quantised ``.npz`` with JSON metadata."""
 
+import functools
 import json
 import os
 import zipfile
@@ -19,6 +20,7 @@ SCHEMA = 1
 # would be noise that only makes the file bigger.
 _BASES = {"identity": 2e-3, "expression": 2e-3, "albedo": 1e-5}
 _LANDMARKS = {"landmarks68": 68, "landmarks468": 468}
+_OCCLUSION = {"occlusion": (9,), "occlusion_slope": (3, 9)}
 
 
 def bundled_models() -> list[str]:
@@ -31,8 +33,9 @@ def bundled_models() -> list[str]:
     )
 
 
+@functools.lru_cache(maxsize=1)
 def load_bundled(name: str = "makehuman") -> MorphableModel:
-    """A model that comes with the package.
+    """A model that comes with the package; the last one is kept.
 
     Raises:
         ValueError: no bundled model has that name.
@@ -78,8 +81,9 @@ def save_model(path: str | os.PathLike, model: MorphableModel, source: dict | No
     if model.quads is not None and model.uv_quads is not None:
         arrays["quads"] = np.asarray(model.quads, np.int32)
         arrays["uv_quads"] = np.asarray(model.uv_quads, np.int32)
-    if model.occlusion is not None:
-        arrays["occlusion"] = np.asarray(model.occlusion, np.float16)
+    for name in _OCCLUSION:
+        if getattr(model, name) is not None:
+            arrays[name] = np.asarray(getattr(model, name), np.float16)
     broken = [k for k, v in arrays.items() if v.dtype.kind == "f" and not np.isfinite(v).all()]
     if broken:
         raise ValueError(f"model {model.name!r} has non-finite values in {broken}")
@@ -151,9 +155,7 @@ def load_model(path: str | os.PathLike) -> MorphableModel:
         licence=metadata["licence"],
         quads=jnp.asarray(arrays["quads"], jnp.int32) if has_quads else None,
         uv_quads=jnp.asarray(arrays["uv_quads"], jnp.int32) if has_quads else None,
-        occlusion=(
-            jnp.asarray(arrays["occlusion"], jnp.float32) if "occlusion" in arrays else None
-        ),
+        **{name: jnp.asarray(arrays[name], jnp.float32) for name in _OCCLUSION if name in arrays},
     )
 
 
@@ -257,8 +259,9 @@ def _validate(arrays: dict[str, np.ndarray], metadata: dict, path: str | os.Path
     if "quads" in arrays or "uv_quads" in arrays:
         expect_index("quads", (None, 4), count, low=-1)
         expect_index("uv_quads", (len(arrays["quads"]), 4), corners, low=-1)
-    if "occlusion" in arrays:
-        expect("occlusion", (count, 9))
+    for name, shape in _OCCLUSION.items():
+        if name in arrays:
+            expect(name, (count, *shape))
     for name, points in _LANDMARKS.items():
         if f"{name}_vertices" in arrays:
             expect_index(f"{name}_vertices", (points, 3), count)

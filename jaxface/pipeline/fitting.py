@@ -154,6 +154,38 @@ def _with_self_shadow(model: MorphableModel, wanted: bool) -> MorphableModel:
     return dataclasses.replace(model, occlusion=self_occlusion(model.mean, model.faces))
 
 
+class _Same:
+    """A model as a key: equal to itself alone."""
+
+    def __init__(self, model: MorphableModel):
+        self.model = model
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.model is self.model
+
+    def __hash__(self) -> int:
+        return id(self.model)
+
+
+@functools.lru_cache(maxsize=1)
+def _kept_levels(
+    same: _Same, self_shadow: bool, count: int, levels: int, details: tuple[int, ...] | None
+) -> tuple[FitModel, ...]:
+    return detail_levels(_with_self_shadow(same.model, self_shadow), count, levels, details)
+
+
+def _prepared_levels(
+    model: MorphableModel, self_shadow: bool, *settings: Any
+) -> tuple[FitModel, ...]:
+    """``detail_levels``, those of the last model kept: a third of a fit at 72k vertices.
+
+    A model with leaves that may change in place (NumPy's) is prepared each time.
+    """
+    fixed = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(model))
+    prepare_levels = _kept_levels if fixed else _kept_levels.__wrapped__
+    return prepare_levels(_Same(model), self_shadow, *settings)
+
+
 def detail_levels(
     model: MorphableModel, landmark_count: int, levels: int, details: Sequence[int] | None = None
 ) -> tuple[FitModel, ...]:
@@ -284,7 +316,6 @@ def fit(
     seen = clock.host("read photo", as_photo, photo)
     if not isinstance(model, MorphableModel):
         model = clock.host("load model", load_model, model)
-    model = clock.host("self-shadow", _with_self_shadow, model, self_shadow)
     weights = weights or FitWeights()
     config = FitConfig(
         steps=tuple(steps), extra_terms=tuple(extra_terms), shadow_directions=shadow_directions
@@ -294,7 +325,10 @@ def fit(
         count = 68 if model.landmarks468 is None else 468
     else:
         count = len(landmarks)
-    models = clock.host("prepare model", detail_levels, model, count, len(steps), details)
+    wanted = None if details is None else tuple(details)
+    models = clock.host(
+        "prepare model", _prepared_levels, model, self_shadow, count, len(steps), wanted
+    )
     # The programs take longest: they are compiled while the detector looks.
     with compiling_levels(clock, input_shapes(size, count), models, weights, config):
         if landmarks is None:
