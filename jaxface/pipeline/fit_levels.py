@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxface._compilation import quick_compilation
+from jaxface._compilation import quick_compilation, quickest_compilation
 from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.pipeline.clock import Clock, KeptProgram
 from jaxface.pipeline.programs import keep_structure
@@ -20,6 +20,7 @@ from jaxface.stages.fit import (
     FitWeights,
     LevelRecord,
     fit_shadows,
+    fit_start,
     through_levels,
 )
 
@@ -27,7 +28,9 @@ from jaxface.stages.fit import (
 @functools.cache
 def _kept(stage: Callable[..., Any], settings: tuple[tuple[str, int], ...]) -> KeptProgram:
     name = "_".join([stage.__name__, *(f"{key}{value}" for key, value in settings)])
-    return KeptProgram(name, functools.partial(stage, **dict(settings)), quick_compilation())
+    # The start takes a few steps over the landmarks, and one pass over the vertices: 0.1 s so.
+    options = quickest_compilation() if stage is fit_start else quick_compilation()
+    return KeptProgram(name, functools.partial(stage, **dict(settings)), options)
 
 
 def _program(stage: Callable[..., Any]) -> KeptProgram:
