@@ -1,5 +1,7 @@
 """The feature extractor: convolutions against the direct sum, gradients, random weights."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxface.models.conv3x3 import METHODS, conv3x3, conv3x3_relu, direct_conv3x3
+from jaxface.models.conv3x3 import (
+    METHODS,
+    conv3x3,
+    conv3x3_relu,
+    direct_conv3x3,
+    prepared_kernel,
+)
 from jaxface.models.features import (
     STYLE_LAYERS,
     FeatureNetwork,
     features,
     layer_position,
     pool,
+    prepare_kernels,
     with_indicator,
 )
 from jaxface.models.random_features import SHAPES, random_network
@@ -22,7 +31,7 @@ from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_
 from jaxface.models.winograd import winograd_conv3x3
 
 SMALL = ((1, 6), (2, 8), (1, 8))
-WIDE = ((1, 16), (2, 16))  # wide enough for Winograd
+WIDE = ((1, 16), (2, 16))
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +120,36 @@ def test_layer_derivatives_in_both_modes(method, x64):
     check_grads(layer, (x, kernel, bias), order=1, modes=["fwd", "rev"], eps=1e-6)
     linear = jax.jit(lambda x, k: conv3x3(x, k, method))
     check_grads(linear, (x, kernel), order=2, modes=["fwd", "rev"], eps=1e-3)
+
+
+def test_prepared_kernels_change_nothing_but_the_time(x64):
+    network = double(random_network(((1, 8), (2, 128)), seed=2))
+    image, direction = numbers(0, 64, 70), numbers(1, 64, 70)
+    prepared = prepare_kernels(network, image.shape)
+    assert prepared_kernel(network.kernels["conv2_2"], 1023) is None  # too small to pay
+    if jax.default_backend() == "cpu":
+        assert list(prepared.prepared) == ["conv2_2"]  # the only wide one
+
+    def response(network, image):
+        return features(network, image, ("conv2_2",))["conv2_2"]
+
+    def both_modes(network):
+        value, forward = jax.jvp(lambda x: response(network, x), (image,), (direction,))
+        reverse = jax.grad(lambda x: jnp.sum(response(network, x) ** 2))(image)
+        return value, forward, reverse
+
+    for one, other in zip(both_modes(network), both_modes(prepared), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+
+    def of_kernel(network):
+        def loss(kernel):
+            kernels = network.kernels | {"conv2_2": kernel}
+            changed = dataclasses.replace(network, kernels=kernels)
+            return jnp.sum(response(changed, image) ** 2)
+
+        return jax.grad(loss)(network.kernels["conv2_2"])
+
+    np.testing.assert_allclose(of_kernel(network), of_kernel(prepared), rtol=1e-9, atol=1e-11)
 
 
 def test_layer_maps_over_images_and_kernels(x64):

@@ -15,7 +15,7 @@ from jaxface.geometry.rotation import similarity_transform
 from jaxface.io.model_file import load_bundled
 from jaxface.models.parameters import FaceParameters
 from jaxface.pipeline import fit
-from jaxface.pipeline.fitting import _prepared_levels
+from jaxface.pipeline.detail_levels import prepared_levels
 from jaxface.stages.fit import (
     FitConfig,
     FitWeights,
@@ -330,19 +330,19 @@ def test_bad_arguments_of_fit_are_named():
 def test_the_last_models_preparation_is_kept():
     model = load_bundled("makehuman")
     assert load_bundled("makehuman") is model
-    levels = _prepared_levels(model, True, 468, 2, (0, 0))
-    assert _prepared_levels(model, True, 468, 2, (0, 0)) is levels
-    without = _prepared_levels(model, False, 468, 2, (0, 0))
+    levels = prepared_levels(model, True, 468, 2, (0, 0))
+    assert prepared_levels(model, True, 468, 2, (0, 0)) is levels
+    without = prepared_levels(model, False, 468, 2, (0, 0))
     assert without[-1].model.occlusion is None
     assert levels[-1].model.occlusion is not None
     again = dataclasses.replace(model, mean=model.mean + 1)
-    moved = _prepared_levels(again, False, 468, 2, (0, 0))
+    moved = prepared_levels(again, False, 468, 2, (0, 0))
     np.testing.assert_array_equal(moved[-1].model.mean, model.mean + 1)
 
 
 def test_a_model_that_may_change_is_prepared_anew():
     model = jax.tree.map(np.array, load_bundled("makehuman"))
-    before = _prepared_levels(model, True, 68, 1, None)[0].points.weights[0, 0]
+    before = prepared_levels(model, True, 68, 1, None)[0].points.weights[0, 0]
     model.landmarks68.weights[0, 0] += 1
-    after = _prepared_levels(model, True, 68, 1, None)[0].points.weights[0, 0]
+    after = prepared_levels(model, True, 68, 1, None)[0].points.weights[0, 0]
     assert after == before + 1

@@ -19,11 +19,11 @@ from jaxface.energies.gram import (
     style_value_and_grad,
 )
 from jaxface.models.feature_tiles import LARGEST_TILE, even_tile, tiling
-from jaxface.models.features import FeatureNetwork, features
+from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, features
 from jaxface.models.random_features import random_network
 
 SHAPE = ((2, 6), (1, 8), (2, 8))
-WIDE = ((1, 16), (2, 16))  # wide enough for Winograd
+WIDE = ((1, 16), (2, 16))
 LAYERS = ("conv1_1", "conv2_1", "conv3_2")
 
 value_and_grad = jax.jit(style_value_and_grad, static_argnums=(3, 4))
@@ -157,6 +157,14 @@ def test_tiles_bound_the_memory(network):
         return program.memory_analysis().temp_size_in_bytes - 4 * 4 * side**2  # less some images
 
     assert temporary(512, 64) < 1.5 * temporary(256, 64) < 0.5 * temporary(512, None)
+
+
+def test_a_tile_takes_what_is_said():
+    network = random_network("vgg19")
+    targets = StyleTargets({name: jnp.eye(network.channels[name]) for name in STYLE_LAYERS})
+    image = jax.ShapeDtypeStruct((2 * LARGEST_TILE,) * 2, jnp.float32)
+    program = value_and_grad.lower(network, image, targets, LARGEST_TILE).compile()
+    assert program.memory_analysis().temp_size_in_bytes < 1.7e9
 
 
 @pytest.mark.parametrize("tile", [None, 8])

@@ -12,6 +12,7 @@ from rich.table import Table
 from jaxface.cli import textures
 from jaxface.cli.console import bar, console, errors, progress, steps
 from jaxface.io.cache import enable_compilation_cache
+from jaxface.io.memory import keep_freed_memory
 
 app = typer.Typer(
     name="jaxface", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -281,6 +282,7 @@ def _run_folder(folder: Path, out: Path, **options: Any) -> None:
 
 def main() -> None:
     """Entry point of the ``jaxface`` command."""
+    keep_freed_memory()
     enable_compilation_cache()
     app()
 

@@ -93,12 +93,13 @@ class GramCache:
         """
         if not self.is_whole(key, thorough=False):
             raise ValueError(f"{self.file(key)} is absent or damaged; precompute it again")
-        return {
-            name: np.memmap(
-                self.file(key), self.types[name], "r", offset=self._offsets[name], shape=shape
-            )
-            for name, shape in self.shapes.items()
-        }
+        content = np.memmap(self.file(key), np.uint8, "r")
+        found = {}
+        for name, shape in self.shapes.items():
+            kind, start = np.dtype(self.types[name]), self._offsets[name]
+            part = content[start : start + math.prod(shape) * kind.itemsize]
+            found[name] = np.asarray(part).view(kind).reshape(shape)
+        return found
 
     def prune(self, keys: Collection[str], maximum_bytes: int) -> None:
         """Remove the oldest files of other keys until the folder holds no more than allowed."""

@@ -18,7 +18,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxface._machine import processor_features
 from jaxface._types import Array, Float
 from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
-from jaxface.models.winograd import winograd_conv3x3
+from jaxface.models.winograd import transformed_kernel, winograd_conv3x3
 
 METHODS = ("auto", "winograd", "direct")
 """``auto``: on CPUs wide layers by Winograd, the first by shifted sums; direct elsewhere"""
@@ -41,8 +41,9 @@ def conv3x3(
         ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
     """
     _check(x, kernel, method)
-    no_gate = jnp.zeros((), bool)
-    return _linear_p.bind(x, kernel, no_gate, gated="no", transpose=False, method=method)
+    no_gate, none = jnp.zeros((), bool), jnp.zeros((0,), kernel.dtype)
+    how = {"gated": "no", "transpose": False, "method": method}
+    return _linear_p.bind(x, kernel, no_gate, none, none, **how)
 
 
 def conv3x3_relu(
@@ -50,16 +51,39 @@ def conv3x3_relu(
     kernel: Float[Array, "3 3 i o"],
     bias: Float[Array, "o"],
     method: str = "auto",
+    prepared: tuple[Float[Array, "36 i o"], Float[Array, "36 i o"]] | None = None,
 ) -> Float[Array, "h w o"]:
     """``max(conv3x3(x, kernel) + bias, 0)``; the derivative at 0 is 0.
 
     Bias, ReLU and, in the backward pass, the ReLU's gate cost no pass over memory of their own.
 
+    Args:
+        x: the image.
+        kernel: HWIO.
+        bias: of each output.
+        method: one of ``METHODS``.
+        prepared: of this kernel, by ``prepared_kernel``; it counts as a constant, and derivatives
+            with respect to the kernel go on to be those with respect to ``kernel``.
+
     Raises:
         ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
     """
     _check(x, kernel, method)
-    return _LAYERS[method](x, kernel, bias)
+    none = jnp.zeros((0,), kernel.dtype)
+    forward, backward = prepared or (none, none)
+    return _LAYERS[method](x, kernel, bias, forward, backward)
+
+
+def prepared_kernel(
+    kernel: Float[Array, "3 3 i o"], pixels: int
+) -> tuple[Float[Array, "36 i o"], Float[Array, "36 i o"]] | None:
+    """What Winograd's convolution and its adjoint make of a kernel, each four times its size.
+
+    None where images of so many pixels are convolved with it in another way on this machine.
+    """
+    if _algorithm(pixels, kernel, "auto", jax.default_backend()) != "winograd":
+        return None
+    return transformed_kernel(kernel), transformed_kernel(kernel[::-1, ::-1])
 
 
 def _check(x: Array, kernel: Array, method: str) -> None:
@@ -82,12 +106,12 @@ def direct_conv3x3(
     return lax.conv_general_dilated(x[None], kernel, (1, 1), "SAME", dimension_numbers=layout)[0]
 
 
-def _algorithm(x: Array, kernel: Array, method: str, platform: str) -> str:
+def _algorithm(pixels: int, kernel: Array, method: str, platform: str) -> str:
     if method != "auto":
         return method
     if platform == "cpu" and kernel.shape[2] <= _NARROW:
         return "shifted sum"
-    if platform != "cpu" or x.shape[0] * x.shape[1] < _LARGE:
+    if platform != "cpu" or pixels < _LARGE:
         return "direct"
     wide = _WIDE_AVX512 if "avx512f" in processor_features() else _WIDE
     return "winograd" if min(kernel.shape[2:]) >= wide else "direct"
@@ -96,7 +120,7 @@ def _algorithm(x: Array, kernel: Array, method: str, platform: str) -> str:
 def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array]) -> None:
     """Shape, compilation and mapping of a primitive that ``compute`` carries out."""
 
-    def shape(x: Any, kernel: Any, _: Any, *, transpose: bool = False, **how: Any) -> Any:
+    def shape(x: Any, kernel: Any, *_: Any, transpose: bool = False, **how: Any) -> Any:
         channels = kernel.shape[2 if transpose else 3]
         return core.ShapedArray((*x.shape[:-1], channels), x.dtype)
 
@@ -125,21 +149,32 @@ def _register(primitive: jax.extend.core.Primitive, compute: Callable[..., Array
 
 
 # A convolution linear in image and kernel, with a gate: the image ("input") or the result
-# ("output") counts only where the third operand is true. Transposing swaps the two.
+# ("output") counts only where the third operand is true. Transposing swaps the two. The last two
+# operands are the prepared kernel, or empty.
 
 _linear_p = jax.extend.core.Primitive("conv3x3")
 _OPPOSITE = {"no": "no", "input": "output", "output": "input"}
 
 
 def _linear(
-    x: Array, kernel: Array, gate: Array, *, gated: str, transpose: bool, method: str, platform: str
+    x: Array,
+    kernel: Array,
+    gate: Array,
+    forward: Array,
+    backward: Array,
+    *,
+    gated: str,
+    transpose: bool,
+    method: str,
+    platform: str,
 ) -> Array:
-    algorithm = _algorithm(x, kernel, method, platform)
+    algorithm = _algorithm(x.shape[0] * x.shape[1], kernel, method, platform)
     if gated == "input" and algorithm != "winograd":
         x = jnp.where(gate, x, 0)
     if algorithm == "winograd":
         input_gate = gate if gated == "input" else None
-        y = winograd_conv3x3(x, kernel, gate=input_gate, transpose=transpose)
+        points = _given(backward if transpose else forward)
+        y = winograd_conv3x3(x, kernel, gate=input_gate, transpose=transpose, transformed=points)
     elif algorithm == "shifted sum":
         y = (shifted_sum_conv3x3_transpose if transpose else shifted_sum_conv3x3)(x, kernel)
     else:
@@ -147,34 +182,41 @@ def _linear(
     return jnp.where(gate, y, 0) if gated == "output" else y
 
 
+def _given(prepared: Array) -> Array | None:
+    return prepared if prepared.size else None
+
+
 def _linear_jvp(primals: Any, tangents: Any, **how: Any) -> Any:
-    x, kernel, gate = primals
-    dx, dkernel, _ = tangents
+    x, kernel, gate, *prepared = primals
+    dx, dkernel, *_ = tangents
     parts = []
     if not isinstance(dx, ad.Zero):
-        parts.append(_linear_p.bind(dx, kernel, gate, **how))
+        parts.append(_linear_p.bind(dx, kernel, gate, *prepared, **how))
     if not isinstance(dkernel, ad.Zero):
-        parts.append(_linear_p.bind(x, dkernel, gate, **how))
-    y = _linear_p.bind(x, kernel, gate, **how)
+        parts.append(_linear_p.bind(x, dkernel, gate, *_unprepared(prepared), **how))
+    y = _linear_p.bind(x, kernel, gate, *prepared, **how)
     return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)
 
 
-def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, **how: Any) -> Any:
+def _unprepared(prepared: Any) -> list[Array]:
+    return [jnp.zeros((0,), one.dtype) for one in prepared]
+
+
+def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, *prepared: Any, **how: Any) -> Any:
     if isinstance(ct, ad.Zero):
-        return [None, None, None]
+        return [None] * 5
     if ad.is_undefined_primal(x):
         back = how | {"gated": _OPPOSITE[how["gated"]], "transpose": not how["transpose"]}
-        return [_linear_p.bind(ct, kernel, gate, **back), None, None]
+        return [_linear_p.bind(ct, kernel, gate, *prepared, **back), *[None] * 4]
 
     gated, transpose = how["gated"], how["transpose"]
 
     def of_kernel(k: Array) -> Array:
-        return _linear(
-            x, k, gate, gated=gated, transpose=transpose, method="direct", platform="any"
-        )
+        how = {"gated": gated, "transpose": transpose, "method": "direct", "platform": "any"}
+        return _linear(x, k, gate, *prepared, **how)
 
     shape = jax.ShapeDtypeStruct(kernel.aval.shape, kernel.aval.dtype)
-    return [None, jax.linear_transpose(of_kernel, shape)(ct)[0], None]
+    return [None, jax.linear_transpose(of_kernel, shape)(ct)[0], None, None, None]
 
 
 _register(_linear_p, _linear)
@@ -187,10 +229,19 @@ ad.primitive_transposes[_linear_p] = _linear_transpose
 _layer_p = jax.extend.core.Primitive("conv3x3_relu")
 
 
-def _layer(x: Array, kernel: Array, bias: Array, *, method: str, platform: str) -> Array:
-    algorithm = _algorithm(x, kernel, method, platform)
+def _layer(
+    x: Array,
+    kernel: Array,
+    bias: Array,
+    forward: Array,
+    backward: Array,
+    *,
+    method: str,
+    platform: str,
+) -> Array:
+    algorithm = _algorithm(x.shape[0] * x.shape[1], kernel, method, platform)
     if algorithm == "winograd":
-        return winograd_conv3x3(x, kernel, bias)
+        return winograd_conv3x3(x, kernel, bias, transformed=_given(forward))
     if algorithm == "shifted sum":
         return shifted_sum_conv3x3(x, kernel, bias)
     return jnp.maximum(direct_conv3x3(x, kernel) + bias, 0)
@@ -199,23 +250,23 @@ def _layer(x: Array, kernel: Array, bias: Array, *, method: str, platform: str) 
 _register(_layer_p, _layer)
 
 
-def _layer_by(method: str) -> Callable[[Array, Array, Array], Array]:
+def _layer_by(method: str) -> Callable[..., Array]:
     @jax.custom_jvp
-    def layer(x: Array, kernel: Array, bias: Array) -> Array:
-        return _layer_p.bind(x, kernel, bias, method=method)
+    def layer(x: Array, kernel: Array, bias: Array, forward: Array, backward: Array) -> Array:
+        return _layer_p.bind(x, kernel, bias, forward, backward, method=method)
 
     def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
-        x, kernel, bias = primals
-        dx, dkernel, dbias = tangents
-        y = layer(x, kernel, bias)
+        x, kernel, bias, *prepared = primals
+        dx, dkernel, dbias, *_ = tangents
+        y = layer(x, kernel, bias, *prepared)
         active = y > 0  # all that a backward pass needs to keep of y: a byte for each value
         how = {"gated": "output", "transpose": False, "method": method}
         zero = jax.custom_derivatives.SymbolicZero
         parts = []
         if not isinstance(dx, zero):
-            parts.append(_linear_p.bind(dx, kernel, active, **how))
+            parts.append(_linear_p.bind(dx, kernel, active, *prepared, **how))
         if not isinstance(dkernel, zero):
-            parts.append(_linear_p.bind(x, dkernel, active, **how))
+            parts.append(_linear_p.bind(x, dkernel, active, *_unprepared(prepared), **how))
         if not isinstance(dbias, zero):
             parts.append(jnp.where(active, dbias, 0))
         return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)

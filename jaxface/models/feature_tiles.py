@@ -26,7 +26,7 @@ from jaxface.models.features import (
     with_indicator,
 )
 
-LARGEST_TILE = 832
+LARGEST_TILE = 1024
 """px; with VGG-19 to conv5_1 a tile of this size takes about 1.6 GB for loss and gradient"""
 
 
@@ -137,13 +137,15 @@ def _responses(
         halo, side = plan.halos[index], plan.tile >> index
         size = side + 2 * halo
         inside = _inside(place * side - halo, size, (shape[0] >> index, shape[1] >> index))
+        # As factors: the zeros of a selection would be made before the loop over tiles, and held.
+        factor = inside[..., None].astype(window.dtype)
         if index:
-            x = jnp.where(inside[..., None], pool(x, network.pooling), 0)
+            x = factor * pool(x, network.pooling)
         else:
             x = with_indicator(jnp.where(inside, window, 0), inside)
         for name in block:
             y = conv3x3_relu(x, network.kernels[name], network.biases[name], method)
-            x = jnp.where(inside[..., None], y, 0)
+            x = factor * y
             if name in layers:
                 wanted[name] = x[halo : halo + side, halo : halo + side]
         cut = len(block)

@@ -79,6 +79,7 @@ def winograd_conv3x3(
     gate: Bool[Array, "h w i"] | None = None,
     transpose: bool = False,
     tiles_at_once: int = _TILES_AT_ONCE,
+    transformed: Float[Array, "36 i o"] | None = None,
 ) -> Float[Array, "h w o"]:
     """Correlation with a 3x3 kernel, zeros outside the image.
 
@@ -92,6 +93,8 @@ def winograd_conv3x3(
         gate: where given, ``x`` counts only where this is true.
         transpose: compute the adjoint, from o channels to i.
         tiles_at_once: how many tiles are transformed at a time, if a row has no more.
+        transformed: of the kernel, or, to ``transpose``, of that turned by 180 degrees
+            (`transformed_kernel`); computed where not given.
     """
     height, width, channels = x.shape
     outputs = kernel.shape[2 if transpose else 3]
@@ -107,9 +110,11 @@ def winograd_conv3x3(
     margin = ((1, strips * step + 1 - height), (1, size[1] - 1 - width), (0, 0))
     padded = jnp.pad(x, margin)
     padded_gate = None if gate is None else jnp.pad(gate, margin)
-    # Transposing the kernel itself would be fused into its transform, and read out of order there.
     zero = jnp.minimum(jnp.abs(x[0, 0, 0]), 0)
-    transformed = _transform_kernel(kernel[::-1, ::-1] if transpose else kernel) + zero
+    # Transposing the kernel too would be fused into its transform, and read out of order there.
+    points = transformed
+    if points is None:
+        points = transformed_kernel((kernel[::-1, ::-1] if transpose else kernel) + zero)
     contracted = ((2,), (2 if transpose else 1,))
 
     def apart(function: Callable[[Array], Array], value: Array) -> Array:
@@ -132,7 +137,7 @@ def winograd_conv3x3(
     def convolved(strip: Array) -> Array:
         along_y = apart(lambda strip: _transform_rows(strip, rows), strip)
         tiles = _transform_columns(along_y, columns)
-        products = lax.dot_general(tiles, transformed, (contracted, ((0,), (0,))))
+        products = lax.dot_general(tiles, points, (contracted, ((0,), (0,))))
         products = products.reshape(_PATCH, _PATCH, rows, columns, outputs)
         return apart(finish, apart(_inverse_rows, products))
 
@@ -154,8 +159,9 @@ def _column(matrix: np.ndarray, index: int, axis: int, ndim: int, like: Array) -
     return jnp.asarray(matrix[:, index].reshape(shape), like.dtype)
 
 
-def _transform_kernel(kernel: Float[Array, "3 3 i o"]) -> Float[Array, "36 i o"]:
-    """The kernel at each of the 36 pairs of interpolation points, ``G g G^T``."""
+@jax.jit
+def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> Float[Array, "36 i o"]:
+    """A kernel at each of the 36 pairs of interpolation points, ``G g G^T``."""
     matrix = np.kron(_KERNEL, _KERNEL)
     return _total(
         _column(matrix, 3 * y + x, 0, 3, kernel) * kernel[y, x] for y in range(3) for x in range(3)

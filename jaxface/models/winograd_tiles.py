@@ -8,21 +8,13 @@ written-out additions, for there is nothing that the compiler could fuse and com
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jaxface._types import Array, Float
-from jaxface.models.winograd import _INPUT, _KERNEL, _OUTPUT
+from jaxface.models.winograd import _INPUT, _OUTPUT
 
 TILES_AT_ONCE = 48
 """tiles of one call; keeps what a call transforms within the processor's second-level cache"""
-
-
-@jax.jit
-def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> Float[Array, "36 i o"]:
-    """``G g G^T`` at each of the 36 pairs of interpolation points."""
-    matrix = jnp.asarray(np.kron(_KERNEL, _KERNEL), kernel.dtype)
-    return jnp.tensordot(matrix, kernel.reshape(9, *kernel.shape[2:]), 1)
 
 
 @jax.jit
@@ -33,7 +25,7 @@ def convolve_tiles(
 
     Args:
         patches: the inputs, one row and column more than the tile on every side.
-        transformed: by `transformed_kernel`.
+        transformed: by `winograd.transformed_kernel`.
         bias: of the layer; the result is ``max(result + bias, 0)``.
     """
     _, tiles, channels = patches.shape

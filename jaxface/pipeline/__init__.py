@@ -5,7 +5,8 @@ of your own, or call the stages yourself.
 """
 
 from jaxface.pipeline.clock import Clock
-from jaxface.pipeline.fitting import FittedFace, as_photo, detail_levels, fit
+from jaxface.pipeline.detail_levels import detail_levels
+from jaxface.pipeline.fitting import FittedFace, as_photo, fit
 from jaxface.pipeline.journeys import digitize, digitize_folder, open_photo, photos_in
 from jaxface.pipeline.saving import save_fit
 from jaxface.pipeline.texturing import Texture, texture

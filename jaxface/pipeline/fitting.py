@@ -1,6 +1,5 @@
 """Photo -> fitted face: landmarks, model, crop and fit in sequence."""
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable, Sequence
@@ -20,10 +19,9 @@ from jaxface.io.models import load_model
 from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
-from jaxface.models.subdivide import subdivide
 from jaxface.pipeline.clock import Clock
+from jaxface.pipeline.detail_levels import prepared_levels
 from jaxface.pipeline.fit_levels import compiling_levels, fit_levels
-from jaxface.render.occlusion import self_occlusion
 from jaxface.stages.fit import (
     FitConfig,
     FitModel,
@@ -34,16 +32,11 @@ from jaxface.stages.fit import (
     WorkingPhoto,
     input_shapes,
     posterior,
-    prepare,
     render_fit,
     skin_map,
     working_photo,
 )
 from jaxface.stages.landmarks import detect_one
-
-SUBDIVIDED_BELOW = 20_000
-"""models with fewer vertices are refined once for the finer pyramid levels"""
-
 
 _posterior_program = jax.jit(posterior)
 _skin_program = jax.jit(skin_map)
@@ -144,78 +137,6 @@ def _brow_program(size: int) -> Any:
 @functools.cache
 def _render_program(size: int) -> Any:
     return jax.jit(lambda y, model, principal: render_fit(y, model, principal, size))
-
-
-def _with_self_shadow(model: MorphableModel, wanted: bool) -> MorphableModel:
-    if not wanted:
-        return dataclasses.replace(model, occlusion=None, occlusion_slope=None)
-    if model.occlusion is not None:
-        return model
-    return dataclasses.replace(model, occlusion=self_occlusion(model.mean, model.faces))
-
-
-class _Same:
-    """A model as a key: equal to itself alone."""
-
-    def __init__(self, model: MorphableModel):
-        self.model = model
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.model is self.model
-
-    def __hash__(self) -> int:
-        return id(self.model)
-
-
-@functools.lru_cache(maxsize=1)
-def _kept_levels(
-    same: _Same, self_shadow: bool, count: int, levels: int, details: tuple[int, ...] | None
-) -> tuple[FitModel, ...]:
-    return detail_levels(_with_self_shadow(same.model, self_shadow), count, levels, details)
-
-
-def _prepared_levels(
-    model: MorphableModel, self_shadow: bool, *settings: Any
-) -> tuple[FitModel, ...]:
-    """``detail_levels``, those of the last model kept: a third of a fit at 72k vertices.
-
-    A model with leaves that may change in place (NumPy's) is prepared each time.
-    """
-    fixed = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(model))
-    prepare_levels = _kept_levels if fixed else _kept_levels.__wrapped__
-    return prepare_levels(_Same(model), self_shadow, *settings)
-
-
-def detail_levels(
-    model: MorphableModel, landmark_count: int, levels: int, details: Sequence[int] | None = None
-) -> tuple[FitModel, ...]:
-    """The model prepared for each pyramid level, coarsest first.
-
-    Args:
-        model: any morphable model.
-        landmark_count: 68 or 468.
-        levels: pyramid levels.
-        details: how often the model is subdivided at each level; by default never at the
-            coarsest, and once at the others if it has fewer than ``SUBDIVIDED_BELOW`` vertices.
-
-    Raises:
-        ValueError: ``details`` does not have one entry a level, or it decreases.
-    """
-    if details is None:
-        finer = int(model.vertex_count < SUBDIVIDED_BELOW)
-        details = [0] + [finer] * (levels - 1)
-    if len(details) != levels or list(details) != sorted(details) or min(details) < 0:
-        raise ValueError(
-            f"details is {list(details)}; {levels} subdivision counts, not decreasing, are needed"
-        )
-    prepared: dict[int, FitModel] = {}
-    current, done = model, 0
-    for detail in details:
-        if detail > done:
-            current, done = subdivide(current, detail - done), detail
-        if detail not in prepared:
-            prepared[detail] = prepare(current, landmark_count)
-    return tuple(prepared[detail] for detail in details)
 
 
 def parse_weights(text: str) -> FitWeights:
@@ -325,9 +246,8 @@ def fit(
         count = 68 if model.landmarks468 is None else 468
     else:
         count = len(landmarks)
-    wanted = None if details is None else tuple(details)
     models = clock.host(
-        "prepare model", _prepared_levels, model, self_shadow, count, len(steps), wanted
+        "prepare model", prepared_levels, model, self_shadow, count, len(steps), details
     )
     # The programs take longest: they are compiled while the detector looks.
     with compiling_levels(clock, input_shapes(size, count), models, weights, config):

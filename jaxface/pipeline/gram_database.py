@@ -3,16 +3,19 @@
 import json
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxface._types import Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.atomic import atomic_path
+from jaxface.io.environment import usable_cores
 from jaxface.io.gram_cache import GramCache, digest
 from jaxface.io.texture_database import Subject, TextureDatabase
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
@@ -216,8 +219,24 @@ def masked_grams(
         name: np.empty((len(cache.keys), channels[name], channels[name]), np.float32)
         for name in cache.layout.cells
     }
-    for index, key in enumerate(cache.keys):
-        for name, value in masked_grams_of(prepared, cache.files.read(key)).items():
-            found[name][index] = value
-        on_progress(index + 1, len(cache.keys))
+    threads = max(1, min(usable_cores(), len(cache.keys)))
+    free = [prepared, *(prepared.for_another_thread() for _ in range(threads - 1))]
+
+    def one(index: int) -> None:
+        own = free.pop()
+        try:
+            for name, value in masked_grams_of(own, cache.files.read(cache.keys[index])).items():
+                found[name][index] = value
+        finally:
+            free.append(own)
+
+    # BLAS is left one thread: textures go side by side.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
+        waiting = [pool.submit(one, index) for index in range(len(cache.keys))]
+        try:
+            for done, future in enumerate(as_completed(waiting), start=1):
+                future.result()
+                on_progress(done, len(cache.keys))
+        finally:
+            pool.shutdown(cancel_futures=True)
     return found

@@ -18,7 +18,7 @@ from jaxface.io.atomic import atomic_path
 from jaxface.io.models import load_model
 from jaxface.io.texture_database import INDEX, TextureDatabase, check_name
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.fitting import detail_levels
+from jaxface.pipeline.detail_levels import detail_levels
 from jaxface.pipeline.journeys import photos_in
 from jaxface.pipeline.photo_fits import BuildStep, FittedPhoto, fit_photos
 from jaxface.pipeline.texture_import import whole_texture

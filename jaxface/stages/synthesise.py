@@ -16,7 +16,7 @@ from jaxface.energies.gram import MASKED, StyleTargets, style_energy
 from jaxface.energies.kept_detail import KnownDetail, known_detail_energy
 from jaxface.energies.term import Energy, Term, compose
 from jaxface.imaging.spectrum import inverse_frequency
-from jaxface.models.features import FeatureNetwork
+from jaxface.models.features import FeatureNetwork, prepare_kernels
 from jaxface.solvers.lbfgs import LBFGSState
 from jaxface.solvers.minimise import Method, minimise
 
@@ -118,6 +118,9 @@ def synthesise(
     if not bool(jnp.all(jnp.isfinite(start))):
         raise ValueError("the start of the synthesis has values that are not finite")
     energy = synthesis_energy(tile, convolution)
+    if tile is None or max(start.shape) <= tile:
+        network = prepare_kernels(problem.network, (start.shape[0], start.shape[1]))
+        problem = eqx.tree_at(lambda p: p.network, problem, network)
 
     def of_change(change: Array, args: tuple[Array, SynthesisProblem]) -> Array:
         start, problem = args

@@ -14,11 +14,8 @@ import numpy as np
 from jaxface._types import Array, Float, Int
 from jaxface.models.features import FeatureNetwork
 from jaxface.models.mask_reach import Plan, Table
-from jaxface.models.winograd_tiles import (
-    TILES_AT_ONCE,
-    convolve_tiles,
-    transformed_kernel,
-)
+from jaxface.models.winograd import transformed_kernel
+from jaxface.models.winograd_tiles import TILES_AT_ONCE, convolve_tiles
 
 PIXELS_AT_ONCE = 4096
 """pixels of one call of the layers that are computed pixel by pixel"""

@@ -47,8 +47,16 @@ class Prepared(NamedTuple):
     """cells that are clear throughout"""
     loose: dict[str, np.ndarray]
     """clear pixels beside them whose cached responses count"""
+    maps: dict[str, Float[np.ndarray, "p n"]]
+    """of the constant image"""
     workspace: Workspace
     """rows of every map, used again for every texture: not for two threads at once"""
+
+    def for_another_thread(self) -> "Prepared":
+        """The same with memory of its own."""
+        channels = {name: rows.shape[1] for name, rows in self.workspace.rows.items()}
+        own = Workspace(self.plan, channels, self.pooling)
+        return self._replace(workspace=_filled(own, self.maps))
 
 
 def prepare(network: FeatureNetwork, visible: Bool[np.ndarray, "h w"], layout: Layout) -> Prepared:
@@ -87,12 +95,26 @@ def prepare(network: FeatureNetwork, visible: Bool[np.ndarray, "h w"], layout: L
         nodes[name] = clear_nodes(reach.clear, cell) if cell else np.zeros(0, np.intp)
         beside = beside_whole_cells(reach.clear, cell) & layout.cached[name]
         loose[name] = np.flatnonzero(beside)
-    workspace = Workspace(work, _channels(network, blocks), network.pooling)
-    for table in work.tables:
-        workspace.blank_rows(table)[:] = maps[table.name][table.blank]
+    workspace = _filled(Workspace(work, _channels(network, blocks), network.pooling), maps)
     return Prepared(
-        visible.shape, network.pooling, layout, work, layers, constant, nodes, loose, workspace
+        visible.shape,
+        network.pooling,
+        layout,
+        work,
+        layers,
+        constant,
+        nodes,
+        loose,
+        maps,
+        workspace,
     )
+
+
+def _filled(workspace: Workspace, maps: dict[str, Float[np.ndarray, "p n"]]) -> Workspace:
+    """With the rows of the constant image, which no texture changes."""
+    for table in workspace.plan.tables:
+        workspace.blank_rows(table)[:] = maps[table.name][table.blank]
+    return workspace
 
 
 def _blank_side(side: int, blocks: Sequence[Sequence[str]]) -> int:
