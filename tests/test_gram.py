@@ -18,7 +18,7 @@ from jaxface.energies.gram import (
     style_energy,
     style_value_and_grad,
 )
-from jaxface.models.feature_tiles import LARGEST_TILE, cuts, even_tile, tiling
+from jaxface.models.feature_tiles import LARGEST_TILE, even_tile, tiling
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, features
 from jaxface.models.random_features import random_network
 
@@ -134,25 +134,6 @@ def test_even_tiles_cover_with_little_overhang(height, width):
     assert count * tile - max(height, width) < 16 * count
 
 
-@given(
-    side=st.integers(1, 6000),
-    tile=st.integers(1, 100).map(lambda n: 16 * n),
-    halo=st.integers(0, 12).map(lambda n: 16 * n),
-)
-def test_windows_hold_their_tiles_and_lie_within_the_image(side, tile, halo):
-    found = cuts(side, tile, halo, 16)
-    full = found.edges[-1]
-    assert side <= full < side + 16 and found.edges[0] == 0
-    tiles = list(zip(found.edges[:-1], found.edges[1:], strict=True))
-    for start, (low, high) in zip(found.starts, tiles, strict=True):
-        assert low < high and low % 16 == high % 16 == start % 16 == 0
-        assert 0 <= start <= max(low - halo, 0)
-        assert min(high + halo, full) <= start + found.window <= full
-    assert found.window <= max(tile, -(-side // 16) * 16 if len(tiles) == 1 else 0) + 2 * halo + 16
-    if side > 4 * halo:
-        assert len(tiles) <= -(-side // tile)
-
-
 def test_tiles_in_single_precision():
     network = random_network(WIDE)
     image, other = (picture(i, 45, 70).astype(jnp.float32) for i in range(2))
@@ -183,7 +164,7 @@ def test_a_tile_takes_what_is_said():
     targets = StyleTargets({name: jnp.eye(network.channels[name]) for name in STYLE_LAYERS})
     image = jax.ShapeDtypeStruct((2 * LARGEST_TILE,) * 2, jnp.float32)
     program = value_and_grad.lower(network, image, targets, LARGEST_TILE).compile()
-    assert program.memory_analysis().temp_size_in_bytes < 1.95e9
+    assert program.memory_analysis().temp_size_in_bytes < 1.7e9
 
 
 @pytest.mark.parametrize("tile", [None, 8])

@@ -4,7 +4,6 @@ G^l(I) = F^l(I) F^l(I)^T / M_l                                        (Gramian, 
 E(I) = sum_l ||F^l(I) - F^l_hat||_F^2 + alpha sum_l ||G^l(I) - G^l_hat||_F^2          (eq. 3)
 """
 
-import math
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float
-from jaxface.models.feature_tiles import Window, sum_over_tiles, window_of_map
+from jaxface.models.feature_tiles import sum_over_tiles, tile_of_map
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, features, layer_position
 
 MASKED = 0.5
@@ -38,26 +37,6 @@ def _gram_jvp(
     pixels = responses.reshape(-1, responses.shape[-1])
     half = pixels.T @ change.reshape(pixels.shape) / pixels.shape[0]
     return gram(responses), half + half.T
-
-
-@jax.custom_jvp
-def _gram_of_tile(
-    responses: Float[Array, "h w n"], tile: Float[Array, "h w 1"]
-) -> Float[Array, "n n"]:
-    """Sum of ``F F^T`` over the pixels of a window where ``tile`` is 1; 0 elsewhere."""
-    channels = responses.shape[-1]
-    return responses.reshape(-1, channels).T @ (tile * responses).reshape(-1, channels)
-
-
-@_gram_of_tile.defjvp
-def _gram_of_tile_jvp(
-    primals: tuple[Array, Array], tangents: tuple[Array, Array]
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    # The responses themselves are what a backward pass keeps, not those of the tile beside them.
-    (responses, tile), (change, _) = primals, tangents
-    channels = responses.shape[-1]
-    half = responses.reshape(-1, channels).T @ (tile * change).reshape(-1, channels)
-    return _gram_of_tile(responses, tile), half + half.T
 
 
 def mask_out(image: Float[Array, "h w"], visible: Bool[Array, "h w"]) -> Float[Array, "h w"]:
@@ -204,32 +183,28 @@ def _statistics(
         }
         return {name: gram(found[name]) for name in gram_layers}, distances
 
+    def of_tile(found: dict[str, Array], place: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        distances = {
+            name: jnp.sum((found[name] - tile_of_map(target, name, place, tile)) ** 2)
+            for name, target in feature_targets.items()
+        }
+        return {name: gram(found[name]) for name in gram_layers}, distances
+
     for name, target in feature_targets.items():
         expected = (*_map_shape(image, name), network.channels[name])
         if target.shape != expected:
             raise ValueError(
                 f"feature target of {name} has shape {target.shape}; needed is {expected}"
             )
-
-    def of_tile(
-        found: dict[str, Array], window: Window
-    ) -> tuple[dict[str, Array], dict[str, Array]]:
-        masks = {name: window.tile_mask(_block(name)).astype(image.dtype) for name in layers}
-        distances = {
-            name: jnp.sum((masks[name] * (found[name] - window_of_map(target, name, window))) ** 2)
-            for name, target in feature_targets.items()
-        }
-        return {name: _gram_of_tile(found[name], masks[name]) for name in gram_layers}, distances
-
     sums, distances = sum_over_tiles(of_tile, network, image, layers, tile, method)
-    sizes = {name: math.prod(_map_shape(image, name)) for name in gram_layers}
-    return {name: sums[name] / sizes[name] for name in gram_layers}, distances
-
-
-def _block(layer: str) -> int:
-    return layer_position(layer)[0] - 1
+    scale = {}
+    for name in gram_layers:
+        height, width = _map_shape(image, name)
+        side = tile >> (layer_position(name)[0] - 1)
+        scale[name] = side**2 / (height * width)
+    return {name: sums[name] * scale[name] for name in gram_layers}, distances
 
 
 def _map_shape(image: Float[Array, "h w"], layer: str) -> tuple[int, int]:
-    block = _block(layer)
+    block = layer_position(layer)[0] - 1
     return image.shape[0] >> block, image.shape[1] >> block
