@@ -62,7 +62,7 @@ def prepare_kernels(network: FeatureNetwork, shape: tuple[int, int]) -> FeatureN
     """The network with what convolutions make of its kernels, for many images of one small shape.
 
     Made anew for each image, they are a tenth of an evaluation of VGG-19 at 256 px; kept they take
-    eight times as much memory as the kernels of the layers that have any: 320 MB there. Tiles do
+    eight times as much memory as the kernels of the layers that have any: 335 MB there. Tiles do
     without. A network that is prepared must not be trained: ``prepared`` stays as it is.
 
     Args:

@@ -72,11 +72,9 @@ def _refine_once(model: MorphableModel) -> MorphableModel:
         "quads": None if triangles_only else jnp.asarray(refined.quads, jnp.int32),
         "uv_quads": None if triangles_only else jnp.asarray(refined_uv.quads, jnp.int32),
     }
-    if model.occlusion is not None:
-        changes["occlusion"] = jnp.asarray(apply(np.asarray(model.occlusion)))
-    if model.occlusion_slope is not None:
-        rows = np.asarray(model.occlusion_slope).reshape(-1, 27)
-        changes["occlusion_slope"] = jnp.asarray(apply(rows).reshape(-1, 3, 9))
+    for name in ("occlusion", "occlusion_slope"):
+        if getattr(model, name) is not None:
+            changes[name] = jnp.asarray(apply(np.asarray(getattr(model, name))))
     for name in ("landmarks68", "landmarks468"):
         points = getattr(model, name)
         if points is not None:

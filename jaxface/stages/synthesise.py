@@ -118,7 +118,7 @@ def synthesise(
     if not bool(jnp.all(jnp.isfinite(start))):
         raise ValueError("the start of the synthesis has values that are not finite")
     energy = synthesis_energy(tile, convolution)
-    if tile is None or max(start.shape) <= tile:
+    if convolution == "auto" and (tile is None or max(start.shape) <= tile):
         network = prepare_kernels(problem.network, (start.shape[0], start.shape[1]))
         problem = eqx.tree_at(lambda p: p.network, problem, network)
 

@@ -47,8 +47,6 @@ class Prepared(NamedTuple):
     """cells that are clear throughout"""
     loose: dict[str, np.ndarray]
     """clear pixels beside them whose cached responses count"""
-    maps: dict[str, Float[np.ndarray, "p n"]]
-    """of the constant image"""
     workspace: Workspace
     """rows of every map, used again for every texture: not for two threads at once"""
 
@@ -56,7 +54,9 @@ class Prepared(NamedTuple):
         """The same with memory of its own."""
         channels = {name: rows.shape[1] for name, rows in self.workspace.rows.items()}
         own = Workspace(self.plan, channels, self.pooling)
-        return self._replace(workspace=_filled(own, self.maps))
+        for table in self.plan.tables:
+            own.blank_rows(table)[:] = self.workspace.blank_rows(table)
+        return self._replace(workspace=own)
 
 
 def prepare(network: FeatureNetwork, visible: Bool[np.ndarray, "h w"], layout: Layout) -> Prepared:
@@ -95,26 +95,12 @@ def prepare(network: FeatureNetwork, visible: Bool[np.ndarray, "h w"], layout: L
         nodes[name] = clear_nodes(reach.clear, cell) if cell else np.zeros(0, np.intp)
         beside = beside_whole_cells(reach.clear, cell) & layout.cached[name]
         loose[name] = np.flatnonzero(beside)
-    workspace = _filled(Workspace(work, _channels(network, blocks), network.pooling), maps)
-    return Prepared(
-        visible.shape,
-        network.pooling,
-        layout,
-        work,
-        layers,
-        constant,
-        nodes,
-        loose,
-        maps,
-        workspace,
-    )
-
-
-def _filled(workspace: Workspace, maps: dict[str, Float[np.ndarray, "p n"]]) -> Workspace:
-    """With the rows of the constant image, which no texture changes."""
-    for table in workspace.plan.tables:
+    workspace = Workspace(work, _channels(network, blocks), network.pooling)
+    for table in work.tables:
         workspace.blank_rows(table)[:] = maps[table.name][table.blank]
-    return workspace
+    return Prepared(
+        visible.shape, network.pooling, layout, work, layers, constant, nodes, loose, workspace
+    )
 
 
 def _blank_side(side: int, blocks: Sequence[Sequence[str]]) -> int:
