@@ -22,6 +22,7 @@ from harness import Benchmark, Measurement
 
 from jaxface.energies.gram import grams, mask_out
 from jaxface.io.feature_weights import load_network
+from jaxface.io.memory import keep_freed_memory
 from jaxface.io.texture_database import Subject
 from jaxface.models.random_features import natural_noise
 from jaxface.pipeline.gram_database import intensity, masked_grams, precompute
@@ -177,6 +178,7 @@ def main(
     folder: Annotated[Path | None, typer.Option(help="of the cache, temporary if absent")] = None,
     name: Annotated[str, typer.Option(help="of the results")] = "masked_grams",
 ) -> None:
+    keep_freed_memory()  # as the command does; both ways gain by it
     bench = Benchmark(name)
     network = load_network(source)
     direct = jax.jit(lambda n, i, v: grams(n, mask_out(i, v)))

@@ -9,19 +9,16 @@ and those of the constant image.
 Everything here depends on the mask and the network's shape alone, not on an image.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion
 
 from jaxface._types import Bool, Int
 from jaxface.models.winograd import TILE
 
 PYRAMID = 4
 """levels of a pyramid of cells, each twice as wide as the one before"""
-
-_SQUARE = np.ones((3, 3), bool)
 
 
 class Reach(NamedTuple):
@@ -41,26 +38,32 @@ class Reach(NamedTuple):
 class Table(NamedTuple):
     """The pixels of one map that are needed, as rows of channels.
 
-    Row 0 is zero. The rows computed from those of the map before follow, then rows of the
-    constant image, then cached ones. Maps are the layers, and each block's input ``poolB``.
+    Row 0 is zero. The rows computed from those of the table before follow, then rows of the
+    constant image, then cached ones. Maps are the layers, and each block's input ``poolB``. A
+    block's last layer has no table where it is wanted for its pooling alone: tiles are pooled as
+    they are made.
     """
 
     name: str
-    sources: Int[np.ndarray, "s t"]
-    """rows of the table before: 36 of a 6x6 patch for each tile of 4x4 computed pixels (first all
-    tiles' first pixels, then their second ones, ...), 9 for each single pixel, or the 4 of a
-    pooled one; 0 rows for the image itself"""
+    layer: str
+    """the convolution that makes the computed rows, or none"""
+    sources: Int[np.ndarray, "t s"]
+    """rows of the table before: 36 of a 6x6 patch for each tile of 4x4 pixels, 9 for each single
+    pixel, or the 4 of a pooled one; 0 for the image itself"""
+    pixels: int
+    """computed rows, one after the other, for each row of sources: 16 of a tile, 4 of one that is
+    pooled, or 1"""
     blank: Int[np.ndarray, "a"]
-    """places in the constant image's small map (see `blank_place`)"""
+    """places in the constant image's map"""
     cached: Int[np.ndarray, "b"]
-    """places in the texture's full map"""
+    """places in the texture's map"""
     counted: Int[np.ndarray, "m"]
     """rows, all computed ones, that count in the layer's Gram matrix"""
 
     @property
     def computed(self) -> int:
         """Number of computed rows."""
-        return self.sources.shape[1] * (TILE**2 if len(self.sources) == 36 else 1)
+        return len(self.sources) * self.pixels
 
     @property
     def rows(self) -> int:
@@ -90,16 +93,31 @@ def reaches(blocks: Sequence[Sequence[str]], visible: Bool[np.ndarray, "h w"]) -
         if name.startswith("pool") and index:
             clear, blank = _all_of_cell(clear), _all_of_cell(blank)
         elif index:
-            clear = binary_erosion(clear, _SQUARE, border_value=1)
-            blank = binary_erosion(blank, _SQUARE, border_value=1)
+            clear, blank = _all_around(clear), _all_around(blank)
         found[name] = Reach(clear, blank)
     return found
 
 
+def _all_around(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Where a pixel and its eight neighbours, as far as there are any, are true."""
+    rows = mask.copy()
+    rows[1:] &= mask[:-1]
+    rows[:-1] &= mask[1:]
+    found = rows.copy()
+    found[:, 1:] &= rows[:, :-1]
+    found[:, :-1] &= rows[:, 1:]
+    return found
+
+
+def _any_around(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Where a pixel or one of its eight neighbours is true."""
+    return ~_all_around(~mask)
+
+
 def _all_of_cell(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
     height, width = (side // 2 * 2 for side in mask.shape)
-    cells = mask[:height, :width].reshape(height // 2, 2, width // 2, 2)
-    return np.asarray(cells.all(axis=(1, 3)))
+    rows = mask[0:height:2, :width] & mask[1:height:2, :width]
+    return rows[:, ::2] & rows[:, 1::2]
 
 
 def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a b"]:
@@ -107,7 +125,9 @@ def whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "a
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % cell), (0, -width % cell)), constant_values=True)
     rows, columns = padded.shape[0] // cell, padded.shape[1] // cell
-    return np.asarray(padded.reshape(rows, cell, columns, cell).all(axis=(1, 3)))
+    # One axis after the other: NumPy is ten times slower at both at once.
+    strips = np.all(padded.reshape(rows, cell, -1), axis=1)
+    return np.asarray(np.all(strips.reshape(rows, columns, cell), axis=2))
 
 
 def beside_whole_cells(mask: Bool[np.ndarray, "h w"], cell: int) -> Bool[np.ndarray, "h w"]:
@@ -148,7 +168,6 @@ def plan(
     cells: Mapping[str, int],
     cached: Mapping[str, bool],
     tiled: Mapping[str, bool],
-    blank_shape: tuple[int, int],
 ) -> Plan:
     """Everything that has to be computed again for a mask.
 
@@ -160,20 +179,20 @@ def plan(
         cached: of each layer, whether its responses to the texture are cached; and of a block's
             input ``poolB`` where it is not.
         tiled: by layer, whether it is computed in 4x4 tiles or pixel by pixel.
-        blank_shape: of the small constant image (see `blank_place`).
     """
     seen = reaches(blocks, visible)
-    wanted = _wanted(blocks, seen, cells, cached)
+    made_by = _convolutions(blocks, cells, tiled)
+    wanted = _wanted(made_by, seen, cells, cached)
     tables: list[Table] = []
     rows, width = np.zeros(0, np.intp), 0
-    block = -1
-    for name in maps_of(blocks):
+    for name, layer in made_by.items():
         reach, (need, computed) = seen[name], wanted[name]
-        block += name.startswith("pool")
-        if name.startswith("pool"):
+        if not layer:
             sources, places = _pooling(computed, rows, width)
-        else:
+        elif layer == name:
             sources, places = _patches(computed, rows, tiled[name])
+        else:
+            sources, places = _pooled_patches(_pooled_cells(computed, seen[layer]), rows)
         blank = np.flatnonzero(need & reach.blank & ~computed)
         whole = np.flatnonzero(need & reach.clear & ~computed)
         rows, width = np.zeros(need.size, np.intp), need.shape[1]
@@ -185,9 +204,22 @@ def plan(
         counted = np.zeros(0, np.intp)
         if name in cells:
             counted = rows[np.flatnonzero(_counted(reach, cells[name], cached[name]))]
-        small = (blank_shape[0] >> block, blank_shape[1] >> block)
-        tables.append(Table(name, sources, blank_place(blank, need.shape, small), whole, counted))
+        pixels = places.size // max(1, len(sources))
+        tables.append(Table(name, layer, sources, pixels, blank, whole, counted))
     return Plan(tuple(tables), {name: seen[name] for name in cells})
+
+
+def _convolutions(
+    blocks: Sequence[Sequence[str]], wanted: Iterable[str], tiled: Mapping[str, bool]
+) -> dict[str, str]:
+    """The maps to be made, in order, and the layer that makes each from the one before."""
+    made_by = {name: "" if name.startswith("pool") else name for name in maps_of(blocks)}
+    for index, block in enumerate(blocks[:-1], start=1):
+        last = block[-1]
+        if last not in wanted and tiled[last]:
+            del made_by[last]
+            made_by[f"pool{index}"] = last
+    return made_by
 
 
 def _counted(reach: Reach, cell: int, cached: bool) -> Bool[np.ndarray, "h w"]:
@@ -198,90 +230,111 @@ def _counted(reach: Reach, cell: int, cached: bool) -> Bool[np.ndarray, "h w"]:
 
 
 def _wanted(
-    blocks: Sequence[Sequence[str]],
+    made_by: Mapping[str, str],
     seen: Mapping[str, Reach],
     cells: Mapping[str, int],
     cached: Mapping[str, bool],
 ) -> dict[str, tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]]:
     """Of every map the pixels needed, and those of them to be computed, from the last one back."""
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    names = maps_of(blocks)
+    names = list(made_by)
     need = np.zeros_like(seen[names[-1]].clear)
     for name, before in zip(reversed(names), [*reversed(names[:-1]), ""], strict=True):
-        reach, pooled = seen[name], name.startswith("pool")
+        reach, layer = seen[name], made_by[name]
         if name in cells:
             need = need | _counted(reach, cells[name], cached[name])
-        computed = need & (reach.mixed if cached.get(name, pooled) else ~reach.blank)
+        computed = need & (reach.mixed if cached.get(name, layer != name) else ~reach.blank)
         found[name] = need, computed
         if not before:
             break
-        if pooled:
-            fresh = computed.repeat(2, axis=0).repeat(2, axis=1)
-            need = np.zeros_like(seen[before].clear)
-            need[: fresh.shape[0], : fresh.shape[1]] = fresh
+        if layer == name:
+            need = _any_around(computed)
         else:
-            need = binary_dilation(computed, _SQUARE)
+            need = _pooled_cells(computed, seen[layer or before])
+            need = _any_around(need) if layer else need
+    return found
+
+
+def _pooled_cells(pooled: Bool[np.ndarray, "h2 w2"], above: Reach) -> Bool[np.ndarray, "h w"]:
+    """The pixels of the map above that pooled ones are made of."""
+    fresh = pooled.repeat(2, axis=0).repeat(2, axis=1)
+    found = np.zeros_like(above.clear)
+    found[: fresh.shape[0], : fresh.shape[1]] = fresh
     return found
 
 
 def _patches(
     computed: Bool[np.ndarray, "h w"], rows: Int[np.ndarray, "p"], tiled: bool
-) -> tuple[Int[np.ndarray, "s t"], Int[np.ndarray, "q"]]:
+) -> tuple[Int[np.ndarray, "t s"], Int[np.ndarray, "q"]]:
     """Sources of a layer's computed pixels, and the places of its rows (-1: outside the map)."""
-    height, width = computed.shape
     y, x = covering_tiles(computed) if tiled else np.nonzero(computed)
-    offsets = np.arange(-1, (TILE if tiled else 1) + 1)
-    patch_y = (y[None, None] + offsets[:, None, None]) + 0 * offsets[None, :, None]
-    patch_x = (x[None, None] + offsets[None, :, None]) + 0 * offsets[:, None, None]
-    inside = (patch_y >= 0) & (patch_y < height) & (patch_x >= 0) & (patch_x < width)
-    place = np.where(inside, patch_y * width + patch_x, -1)
-    sources = np.where(inside, rows[np.maximum(place, 0)], 0)
-    return sources.reshape(len(offsets) ** 2, -1), place[1:-1, 1:-1].reshape(-1)
+    place = _places_around(y, x, TILE if tiled else 1, computed.shape)
+    return _sources(place, rows), place[:, 1:-1, 1:-1].reshape(-1)
+
+
+def _pooled_patches(
+    computed: Bool[np.ndarray, "h w"], rows: Int[np.ndarray, "p"]
+) -> tuple[Int[np.ndarray, "t 36"], Int[np.ndarray, "q"]]:
+    """Sources of tiles that are pooled, and the places of their 2x2 pooled pixels.
+
+    Args:
+        computed: whole cells of 2x2 pixels, so that every tile begins with one.
+        rows: of the pixels of the map before.
+    """
+    y, x = covering_tiles(computed)
+    half = (computed.shape[0] // 2, computed.shape[1] // 2)
+    pooled = _places_around(y // 2, x // 2, TILE // 2, half)[:, 1:-1, 1:-1]
+    return _sources(_places_around(y, x, TILE, computed.shape), rows), pooled.reshape(-1)
+
+
+def _sources(
+    place: Int[np.ndarray, "t s s"], rows: Int[np.ndarray, "p"]
+) -> Int[np.ndarray, "t ss"]:
+    """Rows of places; row 0 outside the map."""
+    found = np.where(place >= 0, rows[np.maximum(place, 0)], 0)
+    return found.reshape(len(place), place.shape[1] ** 2)
+
+
+def _places_around(
+    y: Int[np.ndarray, "t"], x: Int[np.ndarray, "t"], side: int, shape: tuple[int, ...]
+) -> Int[np.ndarray, "t s s"]:
+    """Places of square tiles' pixels, and of those one pixel around (-1: outside the map)."""
+    offsets = np.arange(-1, side + 1)
+    rows = (y[:, None] + offsets)[:, :, None]
+    columns = (x[:, None] + offsets)[:, None]
+    inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+    return np.where(inside, rows * shape[1] + columns, -1)
 
 
 def _pooling(
     computed: Bool[np.ndarray, "h w"], rows: Int[np.ndarray, "p"], above: int
-) -> tuple[Int[np.ndarray, "4 t"], Int[np.ndarray, "t"]]:
+) -> tuple[Int[np.ndarray, "t 4"], Int[np.ndarray, "t"]]:
     """The same for the pooled pixels of a block's input; ``above``: width of the map before."""
     places = np.flatnonzero(computed)
     y, x = np.divmod(places, computed.shape[1])
     corners = [(2 * y + dy) * above + 2 * x + dx for dy in (0, 1) for dx in (0, 1)]
     if not len(places):
-        return np.zeros((4, 0), np.intp), places
-    return np.stack([rows[corner] for corner in corners]), places
-
-
-def blank_place(
-    places: Int[np.ndarray, "n"], shape: tuple[int, ...], small: tuple[int, int]
-) -> Int[np.ndarray, "n"]:
-    """Where a small constant image responds as a large one does at given places of a map.
-
-    Responses to a constant image vary only near its border. All rows and columns in between are
-    the middle one of the small map.
-    """
-
-    def along(index: np.ndarray, full: int, short: int) -> np.ndarray:
-        middle = short // 2
-        far = index - (full - short)
-        return np.where(index < middle, index, np.where(far > middle, far, middle))
-
-    y, x = np.divmod(places, shape[1])
-    return along(y, shape[0], small[0]) * small[1] + along(x, shape[1], small[1])
+        return np.zeros((0, 4), np.intp), places
+    return np.stack([rows[corner] for corner in corners], axis=1), places
 
 
 def covering_tiles(
     needed: Bool[np.ndarray, "h w"],
 ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"]]:
-    """Tops and left edges of disjoint 4x4 tiles that cover the given pixels: few, not fewest."""
+    """Tops and left edges of disjoint 4x4 tiles that cover the given pixels: few, not fewest.
+
+    Strips of four rows are covered from the left, all at once, a tile each in turn.
+    """
     height, width = needed.shape
-    strips = np.pad(needed, ((0, -height % TILE), (0, 0)))
-    strips = np.asarray(np.any(strips.reshape(-1, TILE, width), axis=1))
-    tops, lefts = [], []
-    for strip in np.flatnonzero(np.any(strips, axis=1)).tolist():
-        edge = -1
-        for column in np.flatnonzero(strips[strip]).tolist():
-            if column >= edge:
-                tops.append(strip * TILE)
-                lefts.append(column)
-                edge = column + TILE
-    return np.array(tops, np.int64), np.array(lefts, np.int64)
+    padded = np.pad(needed, ((0, -height % TILE), (0, 0))).reshape(-1, TILE, width)
+    strips = np.asarray(np.any(padded, axis=1))
+    ahead = np.where(strips, np.arange(width), width)
+    ahead = np.minimum.accumulate(ahead[:, ::-1], axis=1)[:, ::-1]
+    ahead = np.pad(ahead, ((0, 0), (0, TILE)), constant_values=width)  # the next column to cover
+    every = np.arange(len(strips))
+    lefts = [ahead[:, 0]]
+    while np.any(lefts[-1] < width):
+        lefts.append(ahead[every, np.minimum(lefts[-1] + TILE, width)])
+    columns = np.stack(lefts, axis=1)
+    strip, turn = np.nonzero(columns < width)
+    return strip * TILE, columns[strip, turn]

@@ -27,6 +27,9 @@ from jaxface.models.mask_reach import pyramid_shapes
 Stored = Mapping[str, np.ndarray]
 """what is cached of a texture, by the names of `layout`"""
 
+LEVELS = 2**16 - 1
+"""what the largest cached value becomes"""
+
 _LARGEST_CELLS = 8.5
 """numbers in a layer's finest cells, for each pixel of the texture, at most"""
 
@@ -105,7 +108,7 @@ def layout(
             if cached[name]:
                 shapes[name] = (height * width, n)
     for name in list(shapes)[1:]:
-        types[name], types[f"{name}/scale"] = "<f2", "<f4"
+        types[name], types[f"{name}/scale"] = "<u2", "<f4"
         shapes[f"{name}/scale"] = (shapes[name][0] if name.endswith("cells") else 1,)
     return Layout(shapes, types, {name: chosen[name] for name in layers}, cached)
 
@@ -115,7 +118,7 @@ def _packed(n: int) -> int:
 
 
 def store(network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout) -> dict[str, Array]:
-    """What is cached of a texture, in single precision; `compressed` halves it. May be jitted.
+    """What is cached of a texture, in single precision; see `compressed`. May be jitted.
 
     Args:
         network: the extractor.
@@ -138,15 +141,19 @@ def store(network: FeatureNetwork, image: Float[Array, "h w"], layout: Layout) -
 
 
 def compressed(found: Mapping[str, Array], layout: Layout) -> dict[str, np.ndarray]:
-    """The arrays that go to disk: half precision with scales."""
+    """The arrays that go to disk: whole numbers of 16 bits, with the scales that belong to them.
+
+    Nothing here is negative. Even steps are finer than half precision's where it matters, at large
+    values, and turn into single precision in one pass.
+    """
     stored: dict[str, np.ndarray] = {}
     for name, value in found.items():
         array = np.asarray(value, np.float32)
-        if layout.types[name] == "<f2":
+        if layout.types[name] == "<u2":
             axis = 1 if name.endswith("cells") else (0, 1)
-            scale = np.maximum(np.abs(array).max(axis=axis, keepdims=True), 1e-30)
+            scale = np.maximum(array.max(axis=axis, keepdims=True) / LEVELS, 1e-30)
             stored[f"{name}/scale"] = scale.reshape(-1).astype("<f4")
-            array = array / scale
+            array = np.rint(array / scale)
         stored[name] = np.ascontiguousarray(array, layout.types[name])
     return stored
 

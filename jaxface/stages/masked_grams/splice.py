@@ -6,29 +6,21 @@ texture, and are cached, with the sums of their products over square cells of la
 that see masked pixels only are the same for every texture; those that see both are computed again,
 tile by tile, from cached, constant and computed ones of the map before.
 
-Cached maps are half precision, each scaled by its largest value; cells have a scale each. That
-changes a Gram matrix by less than 5e-4 of its Frobenius norm, half precision's own rounding: by
-2e-4 where one cell holds a whole small map, by 1e-4 at 1024 pixels, where many cells average.
+Cached maps are whole numbers up to 65535, each with one scale; cells have a scale each. That
+changes a Gram matrix by less than 3e-5 of its Frobenius norm: by up to 2e-5 where one cell holds
+a whole small map, by 5e-6 at 1024 pixels, where many cells average.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Bool, Float
 from jaxface.energies.gram import MASKED
-from jaxface.models.features import FeatureNetwork, blocks_up_to, layer_position, pool
-from jaxface.models.mask_reach import (
-    Plan,
-    beside_whole_cells,
-    blank_place,
-    clear_nodes,
-    maps_of,
-    plan,
-)
+from jaxface.models.constant_response import constant_maps
+from jaxface.models.features import FeatureNetwork, blocks_up_to, layer_position
+from jaxface.models.mask_reach import Plan, beside_whole_cells, clear_nodes, plan
 from jaxface.stages.masked_grams.cells import Layout, Stored
 from jaxface.stages.masked_grams.rows import Layer, Workspace, layer_weights
 
@@ -78,65 +70,23 @@ def prepare(network: FeatureNetwork, visible: Bool[np.ndarray, "h w"], layout: L
     blocks = tuple(blocks_up_to(network, layout.cells))
     layers = {name: layer_weights(network, name) for block in blocks for name in block}
     tiled = {name: layer.tiled for name, layer in layers.items()}
-    rows, columns = (_blank_side(side, blocks) for side in visible.shape)
-    small = (rows, columns)
-    work = plan(blocks, visible, layout.cells, layout.cached, tiled, small)
-    maps = _blank_maps(network, small, blocks, layers)
+    work = plan(blocks, visible, layout.cells, layout.cached, tiled)
+    maps = constant_maps(network, blocks, MASKED, visible.shape)
     constant, nodes, loose = {}, {}, {}
     for name, reach in work.reaches.items():
-        index = layer_position(name)[0] - 1
-        short = (small[0] >> index, small[1] >> index)
-        places = blank_place(np.flatnonzero(reach.blank), reach.blank.shape, short)
-        times = np.bincount(places, minlength=short[0] * short[1])
-        present = np.flatnonzero(times)
-        part = maps[name][present]
-        constant[name] = (part * times[present, None].astype(np.float32)).T @ part
+        values = maps[name].values.reshape(-1, network.channels[name])
+        times = maps[name].count(reach.blank).reshape(-1, 1)
+        constant[name] = (values * times.astype(np.float32)).T @ values
         cell = layout.cells[name]
         nodes[name] = clear_nodes(reach.clear, cell) if cell else np.zeros(0, np.intp)
         beside = beside_whole_cells(reach.clear, cell) & layout.cached[name]
         loose[name] = np.flatnonzero(beside)
     workspace = Workspace(work, _channels(network, blocks), network.pooling)
     for table in work.tables:
-        workspace.blank_rows(table)[:] = maps[table.name][table.blank]
+        workspace.blank_rows(table)[:] = maps[table.name].at(table.blank)
     return Prepared(
         visible.shape, network.pooling, layout, work, layers, constant, nodes, loose, workspace
     )
-
-
-def _blank_side(side: int, blocks: Sequence[Sequence[str]]) -> int:
-    """Side of a small constant image whose border region is that of a large one."""
-    reach = sum((len(block) + 1) << index for index, block in enumerate(blocks))
-    pixel = 1 << len(blocks)
-    return min(side, -(-2 * reach // pixel) * pixel + 2 * pixel + side % pixel)
-
-
-def _blank_maps(
-    network: FeatureNetwork,
-    shape: tuple[int, int],
-    blocks: Sequence[tuple[str, ...]],
-    layers: dict[str, Layer],
-) -> dict[str, Float[np.ndarray, "p n"]]:
-    """All responses to a constant image, and each block's input as ``poolB``.
-
-    As of a texture of which nothing is cached, so that the same compiled programs serve.
-    """
-    nothing = dict.fromkeys(maps_of(blocks), False) | {"pool0": True}
-    tiled = {name: layer.tiled for name, layer in layers.items()}
-    work = plan(
-        blocks, np.ones(shape, bool), dict.fromkeys(layers, 0), nothing, tiled, shape
-    )  # fmt: skip
-    workspace = Workspace(work, _channels(network, blocks), network.pooling)
-    workspace.run({"image": np.full(shape, MASKED, np.float32)}, layers)
-    found = {"pool0": np.array([[MASKED, 1]], np.float32).repeat(math.prod(shape), axis=0)}
-    for table in work.tables:
-        if table.name in layers:
-            found[table.name] = workspace.rows[table.name][table.counted]
-    for index, block in enumerate(blocks[:-1]):
-        height, width = shape[0] >> index, shape[1] >> index
-        last = jnp.asarray(found[block[-1]]).reshape(height, width, -1)
-        pooled = np.asarray(pool(last, network.pooling))
-        found[f"pool{index + 1}"] = pooled.reshape(-1, last.shape[-1])
-    return found
 
 
 def _channels(network: FeatureNetwork, blocks: Sequence[Sequence[str]]) -> dict[str, int]:
