@@ -203,7 +203,7 @@ def plan(
         rows[whole] = 1 + places.size + len(blank) + np.arange(len(whole))
         counted = np.zeros(0, np.intp)
         if name in cells:
-            counted = rows[np.flatnonzero(_counted(reach, cells[name], cached[name]))]
+            counted = np.sort(rows[np.flatnonzero(_counted(reach, cells[name], cached[name]))])
         pixels = places.size // max(1, len(sources))
         tables.append(Table(name, layer, sources, pixels, blank, whole, counted))
     return Plan(tuple(tables), {name: seen[name] for name in cells})

@@ -36,7 +36,7 @@ _LARGEST_CELLS = 8.5
 _FINEST = 16
 """px of a layer's map, side of the finest cells"""
 
-_SMALLEST_CELLED = 192
+_SMALLEST_CELLED = 128
 """px; smaller maps have no cells"""
 
 

@@ -17,11 +17,11 @@ from jaxface.models.mask_reach import Plan, Table
 from jaxface.models.winograd import transformed_kernel
 from jaxface.models.winograd_tiles import convolve_tiles, piece, tiles_at_once
 
-PIXELS_AT_ONCE = 1536
+PIXELS_AT_ONCE = 4096
 """pixels of one call of the layers that are computed pixel by pixel"""
 
-ROWS_AT_ONCE = 1024
-"""rows of one product; as above"""
+NUMBERS_AT_ONCE = 2**18
+"""numbers, in whole rows, that are multiplied with themselves at a time"""
 
 _NARROW = 4
 """layers of no more input channels are computed pixel by pixel"""
@@ -136,8 +136,9 @@ class Workspace:
     ) -> Float[np.ndarray, "n n"]:
         """Sum of ``F F^T`` over some rows, computed or cached ones."""
         total = np.zeros((rows.shape[1],) * 2, np.float32)
-        for start in range(0, len(counted), ROWS_AT_ONCE):
-            some = counted[start : start + ROWS_AT_ONCE]
+        at_once = max(1, NUMBERS_AT_ONCE // rows.shape[1])
+        for start in range(0, len(counted), at_once):
+            some = counted[start : start + at_once]
             part = self._buffer("a", len(some), rows.shape[1])
             if rows.dtype == np.float32:
                 np.take(rows, some, axis=0, mode="clip", out=part)
