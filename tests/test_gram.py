@@ -164,7 +164,7 @@ def test_a_tile_takes_what_is_said():
     targets = StyleTargets({name: jnp.eye(network.channels[name]) for name in STYLE_LAYERS})
     image = jax.ShapeDtypeStruct((2 * LARGEST_TILE,) * 2, jnp.float32)
     program = value_and_grad.lower(network, image, targets, LARGEST_TILE).compile()
-    assert program.memory_analysis().temp_size_in_bytes < 1.65e9
+    assert program.memory_analysis().temp_size_in_bytes < 1.75e9
 
 
 @pytest.mark.parametrize("tile", [None, 8])
