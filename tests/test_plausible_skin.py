@@ -55,6 +55,19 @@ def test_gloss_and_folds_are_bounded_and_hair_is_not_trusted():
     assert white[2] - white[0] < 0.5 * np.log(albedo[60, 60] / SKIN[60, 60])[[2, 0]] @ [1, -1]
 
 
+def test_long_dark_lines_are_bounded_and_moles_are_not():
+    line = np.exp(-0.5 * ((ROWS - 128 - 0.3 * COLUMNS) / 0.7) ** 2)[..., None]
+    mole = disc(60, 128, 1)
+    albedo = SKIN * np.exp(-0.15 * line - 0.15 * mole)
+    found, weight = cleaned(albedo)
+    place = (int(128 + 0.3 * 100), 100)
+    assert log_ratio(albedo)[place] < -0.12 and log_ratio(found)[place] > -0.08
+    assert log_ratio(found)[60, 128] < 0.8 * log_ratio(albedo)[60, 128]
+    kept, _ = cleaned(albedo, dark=np.full_like(PLAIN, 0.3))
+    assert log_ratio(kept)[place] < 0.9 * log_ratio(albedo)[place]
+    assert weight.min() > 0.9
+
+
 def test_what_may_be_dark_stays_dark():
     brow = disc(128, 128, 6)
     albedo = SKIN * np.exp(-0.8 * brow)
