@@ -31,7 +31,7 @@ LINE, LINES = (1 / 700, 1 / 110, 1 / 100), 8
 """standard deviations across and along a fold and of what lies beside it, of the texture's side: 1,
 6 and 7 mm on the bundled model; and directions in which a fold is looked for"""
 
-FOLD = 0.02
+FOLD = 0.03
 """bound of a fold's darkness, as of the others"""
 
 DOUBT = (0.3, 0.7)
@@ -80,7 +80,9 @@ def _plausible(
     removed = band - bounded - tint
     line = _darkest_line((small - wide - removed).mean(-1), share)
     line = jnp.minimum(line + allowed[..., 0], 0.0)[..., None]
-    removed = removed + line - _bound(line, FOLD, FOLD)
+    line = jnp.broadcast_to(line - _bound(line, FOLD, FOLD), removed.shape)
+    # The surroundings stay as dark as they are: every skin has some lines.
+    removed = removed + line - mean(line, share, WIDE)
     removed = jax.image.resize(removed, ratio.shape, "linear")
     detail = ratio - jax.image.resize(fine, ratio.shape, "linear")
     removed = removed + detail - _bound(detail, jnp.inf, SPARKLE)
