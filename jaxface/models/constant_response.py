@@ -41,7 +41,7 @@ class ConstantMap(NamedTuple):
         """The map as it would be of an image that is larger than the small map's."""
         y, x = (
             _place(np.arange(side), side, short)
-            for side, short in zip(shape, self.values.shape, strict=False)
+            for side, short in zip(shape, self.values.shape[:2], strict=True)
         )
         return self.values[y[:, None], x]
 

@@ -4,8 +4,8 @@ Each tile is computed from a window that is larger by the receptive field; what 
 edges disturb is cut off block by block, and responses outside the image are set to zero after
 every layer, as zero padding has it. So the responses are those of the whole image.
 
-The sum is linear in what each tile adds, and each tile is rematerialised: reverse mode visits the
-tiles twice, once for the sums and once, with the sums' cotangent known, for the gradient.
+The sum is linear in what each tile adds, and each tile but the last is rematerialised: reverse mode
+visits these twice, once for the sums and once, with the sums' cotangent known, for the gradient.
 """
 
 import functools

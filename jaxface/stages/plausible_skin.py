@@ -58,7 +58,7 @@ def _plausible(
 
     def mean(x: Array, trust: Array, blur: float) -> Array:
         total = low_pass(trust, blur * coarse)
-        planes = [low_pass(x[..., k] * trust, blur * coarse) for k in range(3)]
+        planes = [low_pass(x[..., k] * trust, blur * coarse) for k in range(x.shape[-1])]
         return jnp.stack(planes, axis=-1) / jnp.maximum(total, 1e-4)[..., None]
 
     share = pooled(weight[..., None])
@@ -80,7 +80,7 @@ def _plausible(
     removed = band - bounded - tint
     line = _darkest_line((small - wide - removed).mean(-1), share)
     line = jnp.minimum(line + allowed[..., 0], 0.0)[..., None]
-    line = jnp.broadcast_to(line - _bound(line, FOLD, FOLD), removed.shape)
+    line = line - _bound(line, FOLD, FOLD)
     # The surroundings stay as dark as they are: every skin has some lines.
     removed = removed + line - mean(line, share, WIDE)
     removed = jax.image.resize(removed, ratio.shape, "linear")

@@ -152,7 +152,7 @@ class Workspace:
         size = math.prod(shape)
         if name not in self._buffers or len(self._buffers[name]) < size:
             self._buffers[name] = _aligned(size)
-        return self._buffers[name][:size].reshape(shape)
+        return piece(self._buffers[name], *shape)
 
 
 def _aligned(*shape: int) -> Float[np.ndarray, "..."]:
