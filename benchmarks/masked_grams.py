@@ -1,16 +1,18 @@
 """Gram matrices of a database's masked textures: from the cache, and by running the network again.
 
-1024x1024 noise with the spectrum of natural images; masks: an ellipse, half of it, and the ellipse
-with holes for eyes, nostrils and mouth. Both ways run in turn in one process, a texture at a time;
-then the whole database behind the mask with holes, from files on disk.
+1024x1024 noise with the spectrum of natural images; masks: an ellipse, half of it, the ellipse with
+holes for eyes, nostrils and mouth, and what photos show, which `digitize` writes. Both ways run in
+turn in one process, a texture at a time; then the whole database behind each mask, from files.
 
-    python benchmarks/masked_grams.py random --textures 64
+    jaxface digitize demo --resolution 1024 -o astronaut
+    python benchmarks/masked_grams.py random --textures 64 --mask astronaut/visibility.png
     python benchmarks/masked_grams.py random-vgg19 --textures 64 --folder /tmp/grams
 """
 
 import os
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +20,7 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import skimage.io
 import typer
 from harness import Benchmark, Measurement
 from threadpoolctl import threadpool_limits
@@ -45,14 +48,21 @@ def disc(x, y, a, b):
     return ((columns - x) / a) ** 2 + ((rows - y) / b) ** 2 < 1
 
 
-def masks() -> dict[str, np.ndarray]:
+def masks(photos: Sequence[Path]) -> dict[str, np.ndarray]:
+    """By name; those of photos are called after their files' folders."""
     face = disc(50, 50, 33, 42)
     holes = np.any([disc(*hole) for hole in HOLES], axis=0)
-    return {
+    found = {
         "ellipse": face,
         "half": face & (np.arange(SIDE) < SIDE // 2),
         "ellipse with holes": face & ~holes,
     }
+    for path in photos:
+        shown = skimage.io.imread(path)
+        if shown.shape != face.shape:
+            raise SystemExit(f"{path} has shape {shown.shape}, not {face.shape}")
+        found[path.resolve().parent.name] = shown >= 128
+    return found
 
 
 class Timer:
@@ -82,12 +92,12 @@ def largest_error(found, true) -> float:
     return max(float(np.linalg.norm(found[k] - true[k]) / np.linalg.norm(true[k])) for k in found)
 
 
-def one_texture(bench: Benchmark, source: str, network, direct) -> None:
+def one_texture(bench: Benchmark, source: str, network, direct, behind) -> None:
     """Every mask, a texture whose cache is in memory."""
     plan = layout(network, (SIDE, SIDE))
     image = jnp.asarray(natural_noise(SIDE, np.random.default_rng(0)), jnp.float32)
     stored = compressed(jax.jit(lambda n, i: store(n, i, plan))(network, image), plan)
-    for name, mask in masks().items():
+    for name, mask in behind.items():
         visible = jnp.asarray(mask)
         prepare(network, mask, plan)  # compiles
         once = best(lambda m=mask: prepare(network, m, plan), 2)
@@ -101,18 +111,16 @@ def one_texture(bench: Benchmark, source: str, network, direct) -> None:
                 ours = best(lambda p=once[2]: masked_grams_of(p, stored), 4)
             whole = np.minimum(whole, again[:2])
             part = np.minimum(part, ours[:2])
-        values = {"processor (s)": part[1], "times faster (processor)": whole[1] / part[1]}
-        values |= {
+        gain = {
+            "times faster (processor)": whole[1] / part[1],
             "times faster (wall)": whole[0] / part[0],
             "largest error": largest_error(ours[2], again[2]),
             "MB a texture": plan.bytes / 1e6,
         }
         title = f"{source}, {name}"
-        before = {"processor (s)": whole[1]}
-        bench.record(Measurement(f"{title}: network again", whole[0], values=before))
-        bench.record(Measurement(f"{title}: from the cache", part[0], values=values))
-        mask_only = {"processor (s)": once[1]}
-        bench.record(Measurement(f"{title}: prepare the mask", once[0], values=mask_only))
+        record(bench, f"{title}: network again", whole)
+        record(bench, f"{title}: from the cache", part, gain)
+        record(bench, f"{title}: prepare the mask", once)
 
 
 class Noise:
@@ -134,52 +142,50 @@ class Noise:
 
 
 def whole_database(
-    bench: Benchmark, source: str, network, direct, count: int, folder: Path, again: int
+    bench: Benchmark, source: str, network, direct, behind, count: int, folder: Path, again: int
 ) -> None:
-    """All textures behind the mask with holes, the mask's preparation and the reading included."""
+    """All textures behind every mask, the mask's preparation and the reading included."""
     database: Any = Noise(folder, count)
+    title = f"{source}, {count} textures"
     with Timer() as building:
         cache = precompute(database, network)
+    record(bench, f"{title}: build the cache", building.both)
     if hasattr(os, "sync"):
         os.sync()  # what the system still writes of the cache would slow down what is timed
-    mask = masks()["ellipse with holes"]
-    with Timer() as first:
-        masked_grams(replace(cache, keys=cache.keys[:1]), mask)
-    visible = jnp.asarray(mask)
     images = [jnp.asarray(intensity(database.encoded(n), SIDE)) for n in database.names[:again]]
-    jax.block_until_ready(direct(network, images[0], visible))
-    # In turn, so that what else the machine does meets both.
-    ours, network_again = np.zeros(2), np.zeros(2)
-    found, true = {}, []
-    for half in np.array_split(np.arange(len(images)), 2):
-        with Timer() as timer:
-            found = masked_grams(cache, mask)
-        ours += timer.both / 2
-        with Timer() as timer:
-            true += [jax.block_until_ready(direct(network, images[i], visible)) for i in half]
-        network_again += timer.both * count / len(images)
-    error = max(largest_error({k: v[i] for k, v in found.items()}, t) for i, t in enumerate(true))
-    title = f"{source}, {count} textures, ellipse with holes"
-    note = "" if len(images) == count else f" ({len(images)} timed)"
-    bench.record(
-        Measurement(
-            f"{title}: network again{note}",
-            network_again[0],
-            values={"processor (s)": network_again[1]},
-        )
-    )
-    values = {
-        "processor (s)": ours[1],
-        "times faster (processor)": network_again[1] / ours[1],
-        "times faster (wall)": network_again[0] / ours[0],
-        "largest error": error,
-        "MB a texture": cache.layout.bytes / 1e6,
-    }
-    bench.record(Measurement(f"{title}: from the cache", ours[0], values=values))
-    before = {"processor (s)": first.processor}
-    bench.record(Measurement(f"{title}: first mask of a process", first.wall, values=before))
-    building_values = {"processor (s)": building.processor}
-    bench.record(Measurement(f"{title}: build the cache", building.wall, values=building_values))
+    jax.block_until_ready(direct(network, images[0], jnp.ones((SIDE, SIDE), bool)))
+    with Timer() as first:
+        masked_grams(replace(cache, keys=cache.keys[:1]), next(iter(behind.values())))
+    record(bench, f"{title}: first mask of a process", first.both)
+    for name, mask in behind.items():
+        # In turn, so that what else the machine does meets both.
+        ours, network_again = np.zeros(2), np.zeros(2)
+        found, error = {}, 0.0
+        for half in np.array_split(np.arange(len(images)), 2):
+            with Timer() as timer:
+                found = masked_grams(cache, mask)
+            ours += timer.both / 2
+            visible = jnp.asarray(mask)
+            with Timer() as timer:
+                true = [jax.block_until_ready(direct(network, images[i], visible)) for i in half]
+            network_again += timer.both * count / len(images)
+            for index, one in zip(half, true, strict=True):
+                error = max(error, largest_error({k: v[index] for k, v in found.items()}, one))
+        timed = "" if len(images) == count else f" ({len(images)} timed)"
+        record(bench, f"{title}, {name}: network again{timed}", network_again)
+        gain = {
+            "times faster (processor)": network_again[1] / ours[1],
+            "times faster (wall)": network_again[0] / ours[0],
+            "largest error": error,
+            "MB a texture": cache.layout.bytes / 1e6,
+        }
+        record(bench, f"{title}, {name}: from the cache", ours, gain)
+
+
+def record(bench: Benchmark, name: str, times, values: Mapping[str, float] | None = None) -> None:
+    """Wall and processor time of what was timed, and what else was measured."""
+    values = {"processor (s)": float(times[1]), **(values or {})}
+    bench.record(Measurement(name, float(times[0]), values=values))
 
 
 def main(
@@ -187,17 +193,19 @@ def main(
     textures: Annotated[int, typer.Option(help="of the database; 0: single ones only")] = 64,
     again: Annotated[int, typer.Option(help="textures that the network is run on again")] = 64,
     folder: Annotated[Path | None, typer.Option(help="of the cache, temporary if absent")] = None,
+    mask: Annotated[list[Path] | None, typer.Option(help="a visibility.png of 1024 px")] = None,
     name: Annotated[str, typer.Option(help="of the results")] = "masked_grams",
 ) -> None:
     keep_freed_memory()  # as the command does; both ways gain by it
     bench = Benchmark(name)
     network = load_network(source)
     direct = jax.jit(lambda n, i, v: grams(n, mask_out(i, v)))
-    one_texture(bench, source, network, direct)
+    behind = masks(mask or [])
+    one_texture(bench, source, network, direct, behind)
     if textures:
         with tempfile.TemporaryDirectory() as temporary:
-            place = folder or Path(temporary)
-            whole_database(bench, source, network, direct, textures, place, min(again, textures))
+            place, again = folder or Path(temporary), min(again, textures)
+            whole_database(bench, source, network, direct, behind, textures, place, again)
     bench.finish([])
 
 

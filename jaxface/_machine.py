@@ -1,6 +1,7 @@
 """What the machine can do."""
 
 import functools
+import os
 
 
 @functools.cache
@@ -11,3 +12,10 @@ def processor_features() -> str:
             return next(x for x in lines if x.lower().startswith(("flags", "features")))
     except (OSError, StopIteration):
         return ""
+
+
+def usable_cores() -> int:
+    """Cores that this process may use, which a container may make fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

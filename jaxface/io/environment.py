@@ -1,12 +1,13 @@
 """What a result was made with: versions, system, processor, devices. No machine is named."""
 
-import os
 import platform
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import jax
+
+from jaxface._machine import usable_cores
 
 PACKAGES = ("jaxface", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "scikit-image")
 
@@ -46,10 +47,3 @@ def processor_name() -> str:
     except OSError:
         pass  # no such file outside Linux
     return platform.processor() or platform.machine()
-
-
-def usable_cores() -> int:
-    """Cores that this process may use, which a container may make fewer than there are."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

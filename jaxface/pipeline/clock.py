@@ -1,7 +1,6 @@
 """Times of a run, with compilation apart."""
 
 import functools
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxface._machine import usable_cores
 from jaxface._types import PyTree
 from jaxface.pipeline.programs import kept_program
 
@@ -50,7 +50,7 @@ class Clock:
         Returns:
             What drops those that are not begun yet.
         """
-        pool = ThreadPoolExecutor(max((os.cpu_count() or 1) - 1, 1))
+        pool = ThreadPoolExecutor(max(usable_cores() - 1, 1))
         for program, args in reversed(calls):
             pool.submit(_compiled, program, *args)
         pool.shutdown(wait=False)

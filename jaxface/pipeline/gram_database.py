@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from jaxface._machine import usable_cores
 from jaxface._types import Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.atomic import atomic_path
-from jaxface.io.environment import usable_cores
 from jaxface.io.gram_cache import GramCache, digest
 from jaxface.io.texture_database import Subject, TextureDatabase
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork

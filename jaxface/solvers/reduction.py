@@ -19,7 +19,6 @@ as many threads as there are processors, each with one thread of BLAS: those of 
 each other in a loop, which on a busy machine costs several times the work itself.
 """
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,6 +30,7 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
+from jaxface._machine import usable_cores
 from jaxface._types import Array, Float
 
 SHIFT = 1e-12
@@ -146,7 +146,7 @@ def _gram(
         return block @ block.T
 
     total = np.zeros((columns, columns))
-    threads = os.cpu_count() or 1
+    threads = usable_cores()
     at_work: deque[Future[np.ndarray]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for block in blocks:
