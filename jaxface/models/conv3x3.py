@@ -20,6 +20,9 @@ from jaxface._types import Array, Float
 from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
 from jaxface.models.winograd import transformed_kernel, winograd_conv3x3
 
+Prepared = tuple[Float[Array, "6 i o"], ...]
+"""`winograd.transformed_kernel` of a kernel, then of it turned by 180 degrees; or empty"""
+
 METHODS = ("auto", "winograd", "direct")
 """``auto``: on CPUs wide layers by Winograd, the first by shifted sums; direct elsewhere"""
 
@@ -41,9 +44,8 @@ def conv3x3(
         ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
     """
     _check(x, kernel, method)
-    no_gate, none = jnp.zeros((), bool), jnp.zeros((0,), kernel.dtype)
     how = {"gated": "no", "transpose": False, "method": method}
-    return _linear_p.bind(x, kernel, no_gate, none, none, **how)
+    return _linear_p.bind(x, kernel, jnp.zeros((), bool), **how)
 
 
 def conv3x3_relu(
@@ -51,7 +53,7 @@ def conv3x3_relu(
     kernel: Float[Array, "3 3 i o"],
     bias: Float[Array, "o"],
     method: str = "auto",
-    prepared: tuple[Float[Array, "36 i o"], Float[Array, "36 i o"]] | None = None,
+    prepared: Prepared = (),
 ) -> Float[Array, "h w o"]:
     """``max(conv3x3(x, kernel) + bias, 0)``; the derivative at 0 is 0.
 
@@ -69,21 +71,17 @@ def conv3x3_relu(
         ValueError: the shapes do not fit, or ``method`` is none of ``METHODS``.
     """
     _check(x, kernel, method)
-    none = jnp.zeros((0,), kernel.dtype)
-    forward, backward = prepared or (none, none)
-    return _LAYERS[method](x, kernel, bias, forward, backward)
+    return _LAYERS[method](x, kernel, bias, *prepared)
 
 
-def prepared_kernel(
-    kernel: Float[Array, "3 3 i o"], pixels: int
-) -> tuple[Float[Array, "36 i o"], Float[Array, "36 i o"]] | None:
+def prepared_kernel(kernel: Float[Array, "3 3 i o"], pixels: int) -> Prepared:
     """What Winograd's convolution and its adjoint make of a kernel, each four times its size.
 
-    None where images of so many pixels are convolved with it in another way on this machine.
+    Empty where images of so many pixels are convolved with it in another way on this machine.
     """
     if _algorithm(pixels, kernel, "auto", jax.default_backend()) != "winograd":
-        return None
-    return transformed_kernel(kernel), transformed_kernel(kernel[::-1, ::-1])
+        return ()
+    return *transformed_kernel(kernel), *transformed_kernel(kernel[::-1, ::-1])
 
 
 def _check(x: Array, kernel: Array, method: str) -> None:
@@ -160,9 +158,7 @@ def _linear(
     x: Array,
     kernel: Array,
     gate: Array,
-    forward: Array,
-    backward: Array,
-    *,
+    *prepared: Array,
     gated: str,
     transpose: bool,
     method: str,
@@ -173,7 +169,8 @@ def _linear(
         x = jnp.where(gate, x, 0)
     if algorithm == "winograd":
         input_gate = gate if gated == "input" else None
-        points = _given(backward if transpose else forward)
+        forward, backward = _both(prepared)
+        points = backward if transpose else forward
         y = winograd_conv3x3(x, kernel, gate=input_gate, transpose=transpose, transformed=points)
     elif algorithm == "shifted sum":
         y = (shifted_sum_conv3x3_transpose if transpose else shifted_sum_conv3x3)(x, kernel)
@@ -182,8 +179,10 @@ def _linear(
     return jnp.where(gate, y, 0) if gated == "output" else y
 
 
-def _given(prepared: Array) -> Array | None:
-    return prepared if prepared.size else None
+def _both(prepared: Prepared) -> tuple[Prepared, Prepared]:
+    """The convolution's part and its adjoint's."""
+    half = len(prepared) // 2
+    return prepared[:half], prepared[half:]
 
 
 def _linear_jvp(primals: Any, tangents: Any, **how: Any) -> Any:
@@ -193,21 +192,17 @@ def _linear_jvp(primals: Any, tangents: Any, **how: Any) -> Any:
     if not isinstance(dx, ad.Zero):
         parts.append(_linear_p.bind(dx, kernel, gate, *prepared, **how))
     if not isinstance(dkernel, ad.Zero):
-        parts.append(_linear_p.bind(x, dkernel, gate, *_unprepared(prepared), **how))
+        parts.append(_linear_p.bind(x, dkernel, gate, **how))
     y = _linear_p.bind(x, kernel, gate, *prepared, **how)
     return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)
 
 
-def _unprepared(prepared: Any) -> list[Array]:
-    return [jnp.zeros((0,), one.dtype) for one in prepared]
-
-
 def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, *prepared: Any, **how: Any) -> Any:
     if isinstance(ct, ad.Zero):
-        return [None] * 5
+        return [None] * (3 + len(prepared))
     if ad.is_undefined_primal(x):
         back = how | {"gated": _OPPOSITE[how["gated"]], "transpose": not how["transpose"]}
-        return [_linear_p.bind(ct, kernel, gate, *prepared, **back), *[None] * 4]
+        return [_linear_p.bind(ct, kernel, gate, *prepared, **back), *[None] * (2 + len(prepared))]
 
     gated, transpose = how["gated"], how["transpose"]
 
@@ -216,7 +211,8 @@ def _linear_transpose(ct: Any, x: Any, kernel: Any, gate: Any, *prepared: Any, *
         return _linear(x, k, gate, *prepared, **how)
 
     shape = jax.ShapeDtypeStruct(kernel.aval.shape, kernel.aval.dtype)
-    return [None, jax.linear_transpose(of_kernel, shape)(ct)[0], None, None, None]
+    of_the_kernel = jax.linear_transpose(of_kernel, shape)(ct)[0]
+    return [None, of_the_kernel, *[None] * (1 + len(prepared))]
 
 
 _register(_linear_p, _linear)
@@ -233,15 +229,13 @@ def _layer(
     x: Array,
     kernel: Array,
     bias: Array,
-    forward: Array,
-    backward: Array,
-    *,
+    *prepared: Array,
     method: str,
     platform: str,
 ) -> Array:
     algorithm = _algorithm(x.shape[0] * x.shape[1], kernel, method, platform)
     if algorithm == "winograd":
-        return winograd_conv3x3(x, kernel, bias, transformed=_given(forward))
+        return winograd_conv3x3(x, kernel, bias, transformed=_both(prepared)[0])
     if algorithm == "shifted sum":
         return shifted_sum_conv3x3(x, kernel, bias)
     return jnp.maximum(direct_conv3x3(x, kernel) + bias, 0)
@@ -252,8 +246,8 @@ _register(_layer_p, _layer)
 
 def _layer_by(method: str) -> Callable[..., Array]:
     @jax.custom_jvp
-    def layer(x: Array, kernel: Array, bias: Array, forward: Array, backward: Array) -> Array:
-        return _layer_p.bind(x, kernel, bias, forward, backward, method=method)
+    def layer(x: Array, kernel: Array, bias: Array, *prepared: Array) -> Array:
+        return _layer_p.bind(x, kernel, bias, *prepared, method=method)
 
     def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
         x, kernel, bias, *prepared = primals
@@ -266,7 +260,7 @@ def _layer_by(method: str) -> Callable[..., Array]:
         if not isinstance(dx, zero):
             parts.append(_linear_p.bind(dx, kernel, active, *prepared, **how))
         if not isinstance(dkernel, zero):
-            parts.append(_linear_p.bind(x, dkernel, active, *_unprepared(prepared), **how))
+            parts.append(_linear_p.bind(x, dkernel, active, **how))
         if not isinstance(dbias, zero):
             parts.append(jnp.where(active, dbias, 0))
         return y, functools.reduce(jnp.add, parts) if parts else jnp.zeros_like(y)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxface._types import Array, Bool, Float
-from jaxface.models.conv3x3 import conv3x3_relu, prepared_kernel
+from jaxface.models.conv3x3 import Prepared, conv3x3_relu, prepared_kernel
 
 STYLE_LAYERS = ("conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1")
 """the layers whose correlations describe detail: the first of each block"""
@@ -36,9 +36,7 @@ class FeatureNetwork(eqx.Module):
     name: str = eqx.field(static=True, default="network")
     licence: str = eqx.field(static=True, default="")
     """one line: licence and credit of the weights"""
-    prepared: dict[str, tuple[Float[Array, "36 i o"], Float[Array, "36 i o"]]] = eqx.field(
-        default_factory=dict
-    )
+    prepared: dict[str, Prepared] = eqx.field(default_factory=dict)
     """by layer, what convolutions make of its kernel, where that is kept (``prepare_kernels``)"""
 
     def __check_init__(self):
@@ -75,7 +73,7 @@ def prepare_kernels(network: FeatureNetwork, shape: tuple[int, int]) -> FeatureN
         return (shape[0] >> block) * (shape[1] >> block)
 
     made = {name: prepared_kernel(k, pixels(name)) for name, k in network.kernels.items()}
-    kept = {name: both for name, both in made.items() if both is not None}
+    kept = {name: both for name, both in made.items() if both}
     return dataclasses.replace(network, prepared=kept)
 
 
@@ -151,7 +149,7 @@ def features(
         x = pool(x, network.pooling) if index else x
         for name in block:
             kernel, bias = network.kernels[name], network.biases[name]
-            x = conv3x3_relu(x, kernel, bias, method, network.prepared.get(name))
+            x = conv3x3_relu(x, kernel, bias, method, network.prepared.get(name, ()))
             if name in layers:
                 wanted[name] = x
     return {name: wanted[name] for name in layers}

@@ -17,13 +17,19 @@ transforms into vector code for all cores only if it is given no reason not to:
 So each map along one axis is the branch of a condition that only we know to be true: nothing is
 fused across it, and it is still shared among the cores.
 
+The six interpolation points along the tiles' first axis go each their own way, from the strip to
+the outputs' columns, and are joined last. What one of them holds is a sixth, and nearer to the
+processor's caches; and their products, which XLA computes on one core if they are small, run side
+by side.
+
 Kernels and buffers are computed from a zero that depends on the image: XLA would otherwise make
 those of all layers at the start of a program, and hold them.
 """
 
 import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +85,7 @@ def winograd_conv3x3(
     gate: Bool[Array, "h w i"] | None = None,
     transpose: bool = False,
     tiles_at_once: int = _TILES_AT_ONCE,
-    transformed: Float[Array, "36 i o"] | None = None,
+    transformed: Sequence[Float[Array, "6 i o"]] = (),
 ) -> Float[Array, "h w o"]:
     """Correlation with a 3x3 kernel, zeros outside the image.
 
@@ -94,7 +100,7 @@ def winograd_conv3x3(
         transpose: compute the adjoint, from o channels to i.
         tiles_at_once: how many tiles are transformed at a time, if a row has no more.
         transformed: of the kernel, or, to ``transpose``, of that turned by 180 degrees
-            (`transformed_kernel`); computed where not given.
+            (`transformed_kernel`); computed where it is empty.
     """
     height, width, channels = x.shape
     outputs = kernel.shape[2 if transpose else 3]
@@ -112,12 +118,12 @@ def winograd_conv3x3(
     padded_gate = None if gate is None else jnp.pad(gate, margin)
     zero = jnp.minimum(jnp.abs(x[0, 0, 0]), 0)
     # Transposing the kernel too would be fused into its transform, and read out of order there.
-    points = transformed
-    if points is None:
-        points = transformed_kernel((kernel[::-1, ::-1] if transpose else kernel) + zero)
+    points = tuple(transformed) or transformed_kernel(
+        (kernel[::-1, ::-1] if transpose else kernel) + zero
+    )
     contracted = ((2,), (2 if transpose else 1,))
 
-    def apart(function: Callable[[Array], Array], value: Array) -> Array:
+    def apart(function: Callable[[Any], Array], value: Any) -> Array:
         shape = jax.eval_shape(function, value)
         # True of NaN as well.
         return lax.cond(
@@ -130,16 +136,18 @@ def winograd_conv3x3(
             return strip
         return jnp.where(lax.dynamic_slice(padded_gate, (i * step, 0, 0), size), strip, 0)
 
-    def finish(half: Array) -> Array:
-        result = _inverse_columns(half)
+    def at_point(strip: Array, point: int) -> Array:
+        along_y = apart(lambda strip: _transform_rows(strip, rows, point), strip)
+        tiles = apart(lambda along_y: _transform_columns(along_y, columns), along_y)
+        products = lax.dot_general(tiles, points[point], (contracted, ((0,), (0,))))
+        return apart(_inverse_columns, products.reshape(_PATCH, rows, columns, outputs))
+
+    def finish(parts: list[Array]) -> Array:
+        result = _inverse_rows(parts)
         return result if bias is None else jnp.maximum(result + bias, 0)
 
     def convolved(strip: Array) -> Array:
-        along_y = apart(lambda strip: _transform_rows(strip, rows), strip)
-        tiles = _transform_columns(along_y, columns)
-        products = lax.dot_general(tiles, points, (contracted, ((0,), (0,))))
-        products = products.reshape(_PATCH, _PATCH, rows, columns, outputs)
-        return apart(finish, apart(_inverse_rows, products))
+        return apart(finish, [at_point(strip, point) for point in range(_PATCH)])
 
     def body(i: Array, out: Array) -> Array:
         return lax.dynamic_update_slice(out, convolved(strip_at(i))[None], (i, 0, 0, 0, 0, 0))
@@ -160,50 +168,52 @@ def _column(matrix: np.ndarray, index: int, axis: int, ndim: int, like: Array) -
 
 
 @jax.jit
-def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> Float[Array, "36 i o"]:
-    """A kernel at each of the 36 pairs of interpolation points, ``G g G^T``."""
-    matrix = np.kron(_KERNEL, _KERNEL)
-    return _total(
-        _column(matrix, 3 * y + x, 0, 3, kernel) * kernel[y, x] for y in range(3) for x in range(3)
+def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> tuple[Float[Array, "6 i o"], ...]:
+    """A kernel at each pair of interpolation points, ``G g G^T``, row by row."""
+    return tuple(
+        _total(
+            row[y] * _column(_KERNEL, x, 0, 3, kernel) * kernel[y, x]
+            for y in range(3)
+            for x in range(3)
+            if row[y]
+        )
+        for row in _KERNEL.tolist()
     )
 
 
-def _transform_rows(strip: Float[Array, "h w i"], rows: int) -> Float[Array, "6 r w i"]:
-    """``B^T`` along the first axis of overlapping tiles of six."""
+def _transform_rows(strip: Float[Array, "h w i"], rows: int, point: int) -> Float[Array, "r w i"]:
+    """A row of ``B^T`` along the first axis of overlapping tiles of six."""
     _, width, channels = strip.shape
     last = TILE * (rows - 1) + 1
     return _total(
-        _column(_INPUT, y, 0, 4, strip)
-        * lax.slice(strip, (y, 0, 0), (y + last, width, channels), (TILE, 1, 1))
-        for y in range(_PATCH)
+        factor * lax.slice(strip, (y, 0, 0), (y + last, width, channels), (TILE, 1, 1))
+        for y, factor in enumerate(_INPUT[point].tolist())
+        if factor
     )
 
 
-def _transform_columns(along_y: Float[Array, "6 r w i"], columns: int) -> Float[Array, "36 t i"]:
-    """``B^T`` along the second axis; one matrix of tiles for each pair of points."""
-    _, rows, _, channels = along_y.shape
+def _transform_columns(along_y: Float[Array, "r w i"], columns: int) -> Float[Array, "6 t i"]:
+    """``B^T`` along the second axis; one matrix of tiles for each point."""
+    rows, _, channels = along_y.shape
     last = TILE * (columns - 1) + 1
     value = _total(
-        _column(_INPUT, x, 1, 5, along_y)
-        * lax.slice(along_y, (0, 0, x, 0), (_PATCH, rows, x + last, channels), (1, 1, TILE, 1))[
-            :, None
-        ]
+        _column(_INPUT, x, 0, 4, along_y)
+        * lax.slice(along_y, (0, x, 0), (rows, x + last, channels), (1, TILE, 1))
         for x in range(_PATCH)
     )
-    return value.reshape(_PATCH**2, rows * columns, channels)
+    return value.reshape(_PATCH, rows * columns, channels)
 
 
-def _inverse_rows(products: Float[Array, "6 6 r c o"]) -> Float[Array, "r 4 6 c o"]:
-    """``A^T`` along the tiles' first axis."""
+def _inverse_columns(products: Float[Array, "6 r c o"]) -> Float[Array, "r c 4 o"]:
+    """``A^T`` along the tiles' second axis."""
     return _total(
-        _column(_OUTPUT, y, 1, 5, products) * jnp.swapaxes(products[y], 0, 1)[:, None]
-        for y in range(_PATCH)
+        _column(_OUTPUT, x, 2, 4, products) * products[x][:, :, None] for x in range(_PATCH)
     )
 
 
-def _inverse_columns(half: Float[Array, "r 4 6 c o"]) -> Float[Array, "r 4 c 4 o"]:
-    """``A^T`` along the tiles' second axis."""
-    return _total(_column(_OUTPUT, x, 3, 5, half) * half[:, :, x, :, None] for x in range(_PATCH))
+def _inverse_rows(parts: Sequence[Float[Array, "r c 4 o"]]) -> Float[Array, "r 4 c 4 o"]:
+    """``A^T`` along the tiles' first axis, of what each of its points gave."""
+    return _total(_column(_OUTPUT, y, 1, 5, part) * part[:, None] for y, part in enumerate(parts))
 
 
 def _total(terms: Iterable[Array]) -> Array:

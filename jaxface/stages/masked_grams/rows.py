@@ -40,7 +40,8 @@ def layer_weights(network: FeatureNetwork, name: str) -> Layer:
     """A layer's weights, transformed where it is computed in tiles."""
     kernel, bias = network.kernels[name], np.asarray(network.biases[name])
     if kernel.shape[2] > _NARROW:
-        return Layer(np.asarray(transformed_kernel(jnp.asarray(kernel))), bias, True)
+        points = np.concatenate(transformed_kernel(jnp.asarray(kernel)))
+        return Layer(points, bias, True)
     return Layer(np.asarray(kernel).reshape(-1, kernel.shape[3]), bias, False)
 
 
