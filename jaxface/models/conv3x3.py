@@ -20,7 +20,7 @@ from jaxface._types import Array, Float
 from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
 from jaxface.models.winograd import transformed_kernel, winograd_conv3x3
 
-Prepared = tuple[Float[Array, "6 i o"], ...]
+Prepared = tuple[Float[Array, "p i o"], ...]
 """`winograd.transformed_kernel` of a kernel, then of it turned by 180 degrees; or empty"""
 
 METHODS = ("auto", "winograd", "direct")

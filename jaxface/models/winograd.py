@@ -17,10 +17,9 @@ transforms into vector code for all cores only if it is given no reason not to:
 So each map along one axis is the branch of a condition that only we know to be true: nothing is
 fused across it, and it is still shared among the cores.
 
-The six interpolation points along the tiles' first axis go each their own way, from the strip to
-the outputs' columns, and are joined last. What one of them holds is a sixth, and nearer to the
-processor's caches; and their products, which XLA computes on one core if they are small, run side
-by side.
+The interpolation points along the tiles' first axis go several ways, from the strip to the outputs'
+columns, and are joined last. What one way holds is nearer to the processor's caches; and products
+that XLA computes on one core, as it does small ones, run side by side.
 
 Kernels and buffers are computed from a zero that depends on the image: XLA would otherwise make
 those of all layers at the start of a program, and hold them.
@@ -73,6 +72,10 @@ _OUTPUT = np.array(
     ]
 )
 
+_WAYS, _MANY_WAYS, _MANY = 2, 6, 256
+"""ways that the points along an axis go, and how many from so many channels on: there six take a
+tenth of the time less than two, in twice the time to compile"""
+
 _TILES_AT_ONCE = 1024
 """tiles of a strip at most, as far as whole rows allow: enough work to be shared, and 36 * 1024
 floats a channel, before the matrix products and after them"""
@@ -85,7 +88,7 @@ def winograd_conv3x3(
     gate: Bool[Array, "h w i"] | None = None,
     transpose: bool = False,
     tiles_at_once: int = _TILES_AT_ONCE,
-    transformed: Sequence[Float[Array, "6 i o"]] = (),
+    transformed: Sequence[Float[Array, "p i o"]] = (),
 ) -> Float[Array, "h w o"]:
     """Correlation with a 3x3 kernel, zeros outside the image.
 
@@ -136,18 +139,20 @@ def winograd_conv3x3(
             return strip
         return jnp.where(lax.dynamic_slice(padded_gate, (i * step, 0, 0), size), strip, 0)
 
-    def at_point(strip: Array, point: int) -> Array:
-        along_y = apart(lambda strip: _transform_rows(strip, rows, point), strip)
+    def one_way(strip: Array, matrix: np.ndarray, kernels: Array) -> Array:
+        along_y = apart(lambda strip: _transform_rows(strip, rows, matrix), strip)
         tiles = apart(lambda along_y: _transform_columns(along_y, columns), along_y)
-        products = lax.dot_general(tiles, points[point], (contracted, ((0,), (0,))))
-        return apart(_inverse_columns, products.reshape(_PATCH, rows, columns, outputs))
+        products = lax.dot_general(tiles, kernels, (contracted, ((0,), (0,))))
+        return apart(_inverse_columns, products.reshape(-1, _PATCH, rows, columns, outputs))
 
     def finish(parts: list[Array]) -> Array:
         result = _inverse_rows(parts)
         return result if bias is None else jnp.maximum(result + bias, 0)
 
     def convolved(strip: Array) -> Array:
-        return apart(finish, [at_point(strip, point) for point in range(_PATCH)])
+        matrices = np.split(_INPUT, len(points))
+        parts = [one_way(strip, m, k) for m, k in zip(matrices, points, strict=True)]
+        return apart(finish, parts)
 
     def body(i: Array, out: Array) -> Array:
         return lax.dynamic_update_slice(out, convolved(strip_at(i))[None], (i, 0, 0, 0, 0, 0))
@@ -168,52 +173,60 @@ def _column(matrix: np.ndarray, index: int, axis: int, ndim: int, like: Array) -
 
 
 @jax.jit
-def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> tuple[Float[Array, "6 i o"], ...]:
-    """A kernel at each pair of interpolation points, ``G g G^T``, row by row."""
+def transformed_kernel(kernel: Float[Array, "3 3 i o"]) -> tuple[Float[Array, "p i o"], ...]:
+    """A kernel at each pair of interpolation points, ``G g G^T``, those of each way together."""
+    ways = _MANY_WAYS if max(kernel.shape) >= _MANY else _WAYS
     return tuple(
         _total(
-            row[y] * _column(_KERNEL, x, 0, 3, kernel) * kernel[y, x]
+            _column(np.kron(rows, _KERNEL), 3 * y + x, 0, 3, kernel) * kernel[y, x]
             for y in range(3)
             for x in range(3)
-            if row[y]
         )
-        for row in _KERNEL.tolist()
+        for rows in np.split(_KERNEL, ways)
     )
 
 
-def _transform_rows(strip: Float[Array, "h w i"], rows: int, point: int) -> Float[Array, "r w i"]:
-    """A row of ``B^T`` along the first axis of overlapping tiles of six."""
+def _transform_rows(
+    strip: Float[Array, "h w i"], rows: int, matrix: np.ndarray
+) -> Float[Array, "p r w i"]:
+    """Rows of ``B^T`` along the first axis of overlapping tiles of six."""
     _, width, channels = strip.shape
     last = TILE * (rows - 1) + 1
     return _total(
-        factor * lax.slice(strip, (y, 0, 0), (y + last, width, channels), (TILE, 1, 1))
-        for y, factor in enumerate(_INPUT[point].tolist())
-        if factor
+        _column(matrix, y, 0, 4, strip)
+        * lax.slice(strip, (y, 0, 0), (y + last, width, channels), (TILE, 1, 1))
+        for y in range(_PATCH)
+        if matrix[:, y].any()
     )
 
 
-def _transform_columns(along_y: Float[Array, "r w i"], columns: int) -> Float[Array, "6 t i"]:
-    """``B^T`` along the second axis; one matrix of tiles for each point."""
-    rows, _, channels = along_y.shape
+def _transform_columns(along_y: Float[Array, "p r w i"], columns: int) -> Float[Array, "q t i"]:
+    """``B^T`` along the second axis; one matrix of tiles for each pair of points."""
+    points, rows, _, channels = along_y.shape
     last = TILE * (columns - 1) + 1
     value = _total(
-        _column(_INPUT, x, 0, 4, along_y)
-        * lax.slice(along_y, (0, x, 0), (rows, x + last, channels), (1, TILE, 1))
+        _column(_INPUT, x, 1, 5, along_y)
+        * lax.slice(along_y, (0, 0, x, 0), (points, rows, x + last, channels), (1, 1, TILE, 1))[
+            :, None
+        ]
         for x in range(_PATCH)
     )
-    return value.reshape(_PATCH, rows * columns, channels)
+    return value.reshape(points * _PATCH, rows * columns, channels)
 
 
-def _inverse_columns(products: Float[Array, "6 r c o"]) -> Float[Array, "r c 4 o"]:
+def _inverse_columns(products: Float[Array, "p 6 r c o"]) -> Float[Array, "p r c 4 o"]:
     """``A^T`` along the tiles' second axis."""
     return _total(
-        _column(_OUTPUT, x, 2, 4, products) * products[x][:, :, None] for x in range(_PATCH)
+        _column(_OUTPUT, x, 3, 5, products) * products[:, x, :, :, None] for x in range(_PATCH)
     )
 
 
-def _inverse_rows(parts: Sequence[Float[Array, "r c 4 o"]]) -> Float[Array, "r 4 c 4 o"]:
-    """``A^T`` along the tiles' first axis, of what each of its points gave."""
-    return _total(_column(_OUTPUT, y, 1, 5, part) * part[:, None] for y, part in enumerate(parts))
+def _inverse_rows(parts: Sequence[Float[Array, "p r c 4 o"]]) -> Float[Array, "r 4 c 4 o"]:
+    """``A^T`` along the tiles' first axis, of all ways' points."""
+    points = [point for part in parts for point in part]
+    return _total(
+        _column(_OUTPUT, y, 1, 5, point) * point[:, None] for y, point in enumerate(points)
+    )
 
 
 def _total(terms: Iterable[Array]) -> Array:
