@@ -136,6 +136,9 @@ class Noise:
     def __len__(self) -> int:
         return len(self.names)
 
+    def stamp(self, name: str) -> str:
+        return f"noise of {SIDE} px"
+
     def encoded(self, name: str) -> np.ndarray:
         plane = natural_noise(SIDE, np.random.default_rng([1, int(name[1:])]))
         return np.repeat(plane[..., None].astype(np.float32), 3, axis=-1)

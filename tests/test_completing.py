@@ -12,8 +12,9 @@ from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.random_features import random_network
 from jaxface.pipeline.completing import CompletionSettings, complete
-from jaxface.pipeline.completion_files import open_database, parse_settings
-from jaxface.pipeline.completion_levels import level_steps, shrink
+from jaxface.pipeline.completion_files import _Checkpoint, open_database, parse_settings
+from jaxface.pipeline.completion_levels import OUTLINE, fading, level_steps, shrink
+from jaxface.pipeline.completion_records import Level
 from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
 
 SIZE = 256
@@ -139,6 +140,30 @@ def test_finished_levels_are_not_made_again(seen, database, network):
     assert again.levels == first.levels
 
 
+def test_a_finished_level_is_that_of_its_inputs_alone(seen, database, network, model, tmp_path):
+    def kept(settings=SETTINGS, network=network, textures=database, seen=seen):
+        return _Checkpoint(tmp_path, settings, network, textures, seen)
+
+    level = Level(np.ones((4, 4), np.float32), {"conv1_1": np.eye(8)}, {"name": "256 px"})
+    kept().write(256, level)
+    found = kept().read(256)
+    assert found is not None and found.record == level.record
+    np.testing.assert_array_equal(found.targets["conv1_1"], level.targets["conv1_1"])
+
+    weights = random_network(((1, 8), (1, 16), (1, 16)), seed=2)  # of the same name
+    assert weights.name == network.name
+    other = TextureDatabase.create(tmp_path / "db", model, SIZE, name="speckles", licence="CC0-1.0")
+    for name in database.names:
+        other.write_subject(name, np.full((SIZE, SIZE, 3), 0.5))
+    less = dataclasses.replace(seen, weight=0.5 * seen.weight)
+    steps = dataclasses.replace(SETTINGS, iterations=13)
+    for changed in ({"network": weights}, {"textures": other}, {"seen": less}, {"settings": steps}):
+        assert kept(**changed).read(256) is None, changed
+    assert kept().read(128) is None
+    next(tmp_path.rglob("*.npz")).write_bytes(b"cut off")
+    assert kept().read(256) is None
+
+
 def test_detail_can_be_kept_out_of_a_region(seen, completed, database, network):
     settings = dataclasses.replace(
         SETTINGS, detail={"forehead": 0.0}, start="low_frequency", match_complexion=False
@@ -201,6 +226,19 @@ def test_shrink_averages_blocks():
     texture = np.arange(16.0).reshape(4, 4, 1)
     np.testing.assert_allclose(shrink(texture, 2)[..., 0], [[2.5, 4.5], [10.5, 12.5]])
     assert shrink(texture, 8).shape == (4, 4, 1)
+
+
+def test_what_is_synthesised_fades_slowly_at_the_outline_and_soon_at_openings():
+    level = 240
+    y, x = np.mgrid[:200, :180]
+    radius, opening = np.hypot(y - 100, x - 90), np.hypot(y - 80, x - 90)
+    free = (radius < 80) & (opening >= 12)
+    share = np.asarray(fading(free, level))
+    assert np.all(share[~free] == 0) and share.max() == 1
+    assert np.all(share[free & (radius < 79 - level // OUTLINE) & (opening > 15)] == 1)
+    along = share[100, 90 + 50 : 90 + 85]  # from the inside to the outline and beyond
+    assert np.all(np.diff(along) <= 0)
+    assert np.abs(np.diff(along)).max() < 2.5 / (level // OUTLINE)  # no step that could be seen
 
 
 def test_another_texture_for_a_mesh_on_disk(tmp_path, model):

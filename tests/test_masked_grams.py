@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxface.energies.gram import grams, mask_out
-from jaxface.io.texture_database import Subject
+from jaxface.io.texture_database import Subject, TextureDatabase
 from jaxface.models.random_features import random_network
 from jaxface.pipeline.gram_database import (
     bytes_to_precompute,
@@ -65,8 +65,11 @@ class Textures:
     def __init__(self, path):
         self.path, self.reads = path, []
         self.subjects = [Subject(name, f"{name}.png", "CC0-1.0") for name in self.names]
+        self._subjects = {subject.name: subject for subject in self.subjects}
         for subject in self.subjects:
             (path / subject.file).write_bytes(b"texture")
+
+    stamp = TextureDatabase.stamp
 
     def __len__(self):
         return len(self.names)

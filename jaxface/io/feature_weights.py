@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxface.io.atomic import atomic_path
 from jaxface.io.cache import cache_dir
+from jaxface.io.gram_cache import digest
 from jaxface.io.restricted_pickle import load_npz, load_pickle
 from jaxface.io.safetensors_file import load_safetensors
 from jaxface.io.torch_file import load_torch_tensors
@@ -221,6 +222,12 @@ def _own(arrays: Mapping[str, np.ndarray], pooling: str | None) -> FeatureNetwor
         name=str(arrays["name"]),
         licence=str(arrays["licence"]),
     )
+
+
+def network_digest(network: FeatureNetwork) -> str:
+    """Digest of all that a network's answers depend on."""
+    layers = [(network.kernels[name], network.biases[name]) for name in network.layers]
+    return digest(network.pooling, *network.layers, *(array for pair in layers for array in pair))
 
 
 def save_network(path: str | Path, network: FeatureNetwork, half: bool = False) -> None:

@@ -196,6 +196,14 @@ class TextureDatabase:
         """A subject's albedo, linear RGB; raises as `encoded`."""
         return np.asarray(srgb_to_linear(jnp.asarray(self.encoded(name))))
 
+    def stamp(self, name: str) -> str:
+        """Size and time of change of a subject's file, by which it is taken to be the same."""
+        try:
+            status = (self.path / self._subjects[name].file).stat()
+        except OSError:
+            return "absent"
+        return f"{status.st_size} {status.st_mtime_ns}"
+
     def is_whole(self, name: str) -> bool:
         """Whether a subject is listed and its file is an image of the right size."""
         if name not in self._subjects:

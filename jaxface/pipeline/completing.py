@@ -17,7 +17,7 @@ from jaxface.imaging.resample import resize
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.feature_tiles import even_tile
 from jaxface.models.features import FeatureNetwork
-from jaxface.pipeline.completion_levels import level_steps, nearest_positive, shrink
+from jaxface.pipeline.completion_levels import fading, level_steps, nearest_positive, shrink
 from jaxface.pipeline.completion_records import (
     Blending,
     Completed,
@@ -29,7 +29,6 @@ from jaxface.pipeline.seen_texture import SeenTexture
 from jaxface.stages.blend import Blend, blend
 from jaxface.stages.detail import (
     COMPLEXION,
-    soft_inside,
     with_complexion,
     with_intensity,
     with_photo,
@@ -330,8 +329,7 @@ class _Work:
         """The synthesised intensity with the start's colour, in the start's surroundings."""
         level = len(start)
         box = self.box(level)
-        free = jnp.asarray(self.cut(self.maps(level).mask, level))
-        soft = soft_inside(free, max(level // 128, 2))
+        soft = fading(self.cut(self.maps(level).mask, level), level)
         colour = jnp.asarray(start[box])
         mixed = soft * intensity + (1 - soft) * rgb_to_yiq(colour)[..., 0]
         whole = np.array(start)

@@ -1,7 +1,6 @@
 """`jaxface texture`: complete the albedo in a folder that a fit has written, and resume it."""
 
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -14,12 +13,15 @@ import numpy as np
 
 from jaxface._types import Float
 from jaxface.io.atomic import atomic_path
-from jaxface.io.feature_weights import load_network
+from jaxface.io.feature_weights import load_network, network_digest
+from jaxface.io.gram_cache import digest
 from jaxface.io.image import write_png
 from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase, databases_dir
+from jaxface.models.features import FeatureNetwork
 from jaxface.pipeline.completing import Completed, CompletionSettings, Level, complete
 from jaxface.pipeline.completion_outputs import save_completed
+from jaxface.pipeline.programs import source_digest
 from jaxface.pipeline.seen_texture import SeenTexture, read_seen_texture
 from jaxface.pipeline.skin_database import PAINTING, synth_database
 from jaxface.stages.synthesise import SynthesisWeights
@@ -75,7 +77,7 @@ def complete_folder(
     # Complete, if smooth: a first look while the database is painted and compared.
     write_png(place / "albedo_preview.png", seen.low_frequency)
     textures = open_database(database, model or seen.model.name, seen.resolution, on_step)
-    work = _Checkpoint(place, settings, network.name, textures, seen)
+    work = _Checkpoint(place, settings, network, textures, seen)
     shown = -PREVIEW_SECONDS  # the first picture is shown at once
 
     def on_progress(
@@ -131,15 +133,19 @@ class _Checkpoint:
         self,
         place: Path,
         settings: CompletionSettings,
-        network: str,
+        network: FeatureNetwork,
         textures: TextureDatabase,
         seen: SeenTexture,
     ) -> None:
-        facts = [
-            repr(settings), network, textures.names, textures.resolution, seen.resolution,
-            hashlib.sha256(seen.photo.tobytes()).hexdigest(),
-        ]  # fmt: skip
-        self.key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+        stamps = [f"{name} {textures.stamp(name)}" for name in textures.names]
+        self.key = digest(
+            source_digest(),
+            repr(settings),
+            network_digest(network),
+            *stamps,
+            seen.photo,
+            seen.weight,
+        )[:16]
         self.folder = place / WORK_FOLDER
 
     def _file(self, level: int) -> Path:

@@ -2,8 +2,26 @@
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import binary_fill_holes
 
-from jaxface._types import Array, Float
+from jaxface._types import Array, Bool, Float
+from jaxface.stages.detail import soft_inside
+
+OUTLINE = 24
+"""part of a texture's side over which what is synthesised fades at the outline of the face"""
+
+
+def fading(free: Bool[np.ndarray, "h w"], level: int) -> Float[Array, "h w"]:
+    """How much of what is synthesised counts: 1, falling to 0 at the outline of the free texels.
+
+    Slowly there, where blotches that end at once would show a seam; soon around eyes and mouth.
+
+    Args:
+        free: the texels that are synthesised.
+        level: texels along a side of the whole texture.
+    """
+    outer = soft_inside(jnp.asarray(binary_fill_holes(free)), max(level // OUTLINE, 2))
+    return outer * soft_inside(jnp.asarray(free), max(level // 128, 2))
 
 
 def nearest_positive(gram: Float[Array, "n n"]) -> Array:

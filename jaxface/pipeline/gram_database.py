@@ -16,8 +16,9 @@ from jaxface._machine import usable_cores
 from jaxface._types import Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.atomic import atomic_path
+from jaxface.io.feature_weights import network_digest
 from jaxface.io.gram_cache import GramCache, digest
-from jaxface.io.texture_database import Subject, TextureDatabase
+from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
 from jaxface.stages.masked_grams import (
     Layout,
@@ -98,7 +99,7 @@ def precompute(
     compute = jax.jit(lambda network, image: store(network, image, plan))
     keys: list[str] = []
     for index, subject in enumerate(database.subjects):
-        stamp, (before, key) = _stamp(database, subject), known.get(subject.name, ("", ""))
+        stamp, (before, key) = database.stamp(subject.name), known.get(subject.name, ("", ""))
         if before != stamp or not files.is_whole(key):
             image = intensity(database.encoded(subject.name), side)
             key = digest(identity, image)
@@ -133,7 +134,7 @@ def find_precomputed(
     keys = []
     for subject in database.subjects:
         stamp, key = known.get(subject.name, ("", ""))
-        if stamp != _stamp(database, subject) or not files.is_whole(key, thorough=False):
+        if stamp != database.stamp(subject.name) or not files.is_whole(key, thorough=False):
             return None
         keys.append(key)
     return PrecomputedGrams(network, plan, files, tuple(keys))
@@ -154,21 +155,7 @@ def _files(
         )
     plan = layout(network, (side, side), layers)
     files = GramCache(folder or database.path / FOLDER, plan.shapes, plan.types)
-    identity = digest(
-        network.pooling,
-        repr(plan),
-        *(network.kernels[name] for name in network.layers),
-        *(network.biases[name] for name in network.layers),
-    )
-    return plan, files, side, identity
-
-
-def _stamp(database: TextureDatabase, subject: Subject) -> str:
-    try:
-        status = (database.path / subject.file).stat()
-    except OSError:
-        return "absent"
-    return f"{status.st_size} {status.st_mtime_ns}"
+    return plan, files, side, digest(network_digest(network), repr(plan))
 
 
 def _read_stamps(folder: Path) -> dict[str, dict[str, tuple[str, str]]]:

@@ -73,7 +73,7 @@ def kept_program(name: str, program: Callable[..., PyTree], *args: PyTree) -> Ca
     text = f"{name} {structure} {[(x.shape, str(x.dtype)) for x in shapes]}"
     if not folder or " at 0x" in text:
         return flat
-    versions = f"{jaxface.__version__} {_source_digest()} {jax.__version__} {jax.default_backend()}"
+    versions = f"{jaxface.__version__} {source_digest()} {jax.__version__} {jax.default_backend()}"
     wide = jax.config.values["jax_enable_x64"]
     digest = hashlib.sha256(f"{text} {versions} {wide}".encode()).hexdigest()
     path = Path(folder) / f"traced-{name}-{digest[:32]}"
@@ -94,7 +94,8 @@ def _dtype(x: Any) -> Any:
 
 
 @functools.cache
-def _source_digest() -> str:
+def source_digest() -> str:
+    """Of this package's code: what it wrote can differ from what other code would write."""
     digest = hashlib.sha256()
     for path in sorted(Path(jaxface.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
