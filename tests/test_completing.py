@@ -13,7 +13,7 @@ from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.random_features import random_network
 from jaxface.pipeline.completing import CompletionSettings, complete
 from jaxface.pipeline.completion_files import _Checkpoint, open_database, parse_settings
-from jaxface.pipeline.completion_levels import OUTLINE, fading, level_steps, shrink
+from jaxface.pipeline.completion_levels import OUTLINE, faded, level_steps, shrink
 from jaxface.pipeline.completion_records import Level
 from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
 
@@ -228,17 +228,25 @@ def test_shrink_averages_blocks():
     assert shrink(texture, 8).shape == (4, 4, 1)
 
 
-def test_what_is_synthesised_fades_slowly_at_the_outline_and_soon_at_openings():
-    level = 240
+def test_blotches_fade_slowly_at_the_outline_and_pores_soon():
+    level = 480
     y, x = np.mgrid[:200, :180]
     radius, opening = np.hypot(y - 100, x - 90), np.hypot(y - 80, x - 90)
     free = (radius < 80) & (opening >= 12)
-    share = np.asarray(fading(free, level))
-    assert np.all(share[~free] == 0) and share.max() == 1
-    assert np.all(share[free & (radius < 79 - level // OUTLINE) & (opening > 15)] == 1)
-    along = share[100, 90 + 50 : 90 + 85]  # from the inside to the outline and beyond
-    assert np.all(np.diff(along) <= 0)
-    assert np.abs(np.diff(along)).max() < 2.5 / (level // OUTLINE)  # no step that could be seen
+    narrow, wide = level // 128 + 2, level // OUTLINE
+
+    blotch = np.asarray(faded(np.ones(free.shape), free, level))
+    assert np.all(blotch[~free] == 0)
+    well_inside = free & (radius < 78 - wide) & (opening > 13 + narrow)
+    np.testing.assert_allclose(blotch[well_inside], 1, atol=0.02)
+    along = blotch[100, 90 + 60 : 90 + 85]  # from the inside to the outline and beyond
+    assert np.abs(np.diff(along)).max() < 0.35  # a step of 1 would be seen
+    assert along[80 - 60 - wide // 2] < 0.7
+
+    pores = np.where((y + x) % 2 == 0, 1.0, -1.0)
+    kept = np.abs(np.asarray(faded(pores, free, level)))
+    near_outline = free & (radius < 79 - narrow) & (radius > 79 - wide) & (opening > 13 + narrow)
+    assert kept[near_outline].mean() > 0.9
 
 
 def test_another_texture_for_a_mesh_on_disk(tmp_path, model):

@@ -17,7 +17,7 @@ from jaxface.imaging.resample import resize
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.feature_tiles import even_tile
 from jaxface.models.features import FeatureNetwork
-from jaxface.pipeline.completion_levels import fading, level_steps, nearest_positive, shrink
+from jaxface.pipeline.completion_levels import faded, level_steps, nearest_positive, shrink
 from jaxface.pipeline.completion_records import (
     Blending,
     Completed,
@@ -329,9 +329,9 @@ class _Work:
         """The synthesised intensity with the start's colour, in the start's surroundings."""
         level = len(start)
         box = self.box(level)
-        soft = fading(self.cut(self.maps(level).mask, level), level)
         colour = jnp.asarray(start[box])
-        mixed = soft * intensity + (1 - soft) * rgb_to_yiq(colour)[..., 0]
+        first = rgb_to_yiq(colour)[..., 0]
+        mixed = first + faded(intensity - first, self.cut(self.maps(level).mask, level), level)
         whole = np.array(start)
         whole[box] = np.asarray(with_intensity(colour, mixed))
         inside = shrink(self.seen.inside[..., None].astype(np.float32), level)

@@ -5,23 +5,35 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 
 from jaxface._types import Array, Bool, Float
+from jaxface.energies.kept_detail import low_pass
 from jaxface.stages.detail import soft_inside
 
-OUTLINE = 24
-"""part of a texture's side over which what is synthesised fades at the outline of the face"""
+OUTLINE = 48
+"""part of a texture's side over which synthesised blotches fade at the outline of the face"""
+
+BLOTCHES = 192
+"""part of a texture's side, standard deviation of the low-pass that tells them from pores"""
 
 
-def fading(free: Bool[np.ndarray, "h w"], level: int) -> Float[Array, "h w"]:
-    """How much of what is synthesised counts: 1, falling to 0 at the outline of the free texels.
+def faded(
+    change: Float[Array, "h w"], free: Bool[np.ndarray, "h w"], level: int
+) -> Float[Array, "h w"]:
+    """What the synthesis changed, falling to 0 towards the texels that it left alone.
 
-    Slowly there, where blotches that end at once would show a seam; soon around eyes and mouth.
+    At the outline of the free texels blotches fade slowly, for where they end at once they show a
+    seam, and pores soon, as both do around eyes and mouth (after Burt and Adelson, "A
+    multiresolution spline", 1983).
 
     Args:
-        free: the texels that are synthesised.
+        change: of the intensity.
+        free: the texels that were synthesised.
         level: texels along a side of the whole texture.
     """
-    outer = soft_inside(jnp.asarray(binary_fill_holes(free)), max(level // OUTLINE, 2))
-    return outer * soft_inside(jnp.asarray(free), max(level // 128, 2))
+    outline = soft_inside(jnp.asarray(binary_fill_holes(free)), max(level // OUTLINE, 2))
+    rim = soft_inside(jnp.asarray(free), max(level // 128, 2))
+    change = jnp.where(free, change, 0)
+    blotches = low_pass(change, level / BLOTCHES)
+    return rim * (change - (1 - outline) * blotches)
 
 
 def nearest_positive(gram: Float[Array, "n n"]) -> Array:
