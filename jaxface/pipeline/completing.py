@@ -331,7 +331,8 @@ class _Work:
         box = self.box(level)
         colour = jnp.asarray(start[box])
         first = rgb_to_yiq(colour)[..., 0]
-        mixed = first + faded(intensity - first, self.cut(self.maps(level).mask, level), level)
+        change = jnp.asarray(intensity) - first
+        mixed = first + faded(change, self.cut(self.maps(level).mask, level), level)
         whole = np.array(start)
         whole[box] = np.asarray(with_intensity(colour, mixed))
         inside = shrink(self.seen.inside[..., None].astype(np.float32), level)

@@ -11,6 +11,9 @@ from jaxface.stages.detail import soft_inside
 OUTLINE = 48
 """part of a texture's side over which synthesised blotches fade at the outline of the face"""
 
+COMPLEXION = 64
+"""part of a texture's side, standard deviation of the low-pass that is the complexion's"""
+
 BLOTCHES = 192
 """part of a texture's side, standard deviation of the low-pass that tells them from pores"""
 
@@ -20,6 +23,7 @@ def faded(
 ) -> Float[Array, "h w"]:
     """What the synthesis changed, falling to 0 towards the texels that it left alone.
 
+    Not of the complexion, which the low frequencies and the photo give, and a Gramian moves freely.
     At the outline of the free texels blotches fade slowly, for where they end at once they show a
     seam, and pores soon, as both do around eyes and mouth (after Burt and Adelson, "A
     multiresolution spline", 1983).
@@ -32,6 +36,7 @@ def faded(
     outline = soft_inside(jnp.asarray(binary_fill_holes(free)), max(level // OUTLINE, 2))
     rim = soft_inside(jnp.asarray(free), max(level // 128, 2))
     change = jnp.where(free, change, 0)
+    change = change - jnp.where(free, low_pass(change, level / COMPLEXION), 0)
     blotches = low_pass(change, level / BLOTCHES)
     return rim * (change - (1 - outline) * blotches)
 
