@@ -142,12 +142,13 @@ def main() -> None:
                     answer = json.loads(done.stdout.strip().splitlines()[-1])
                     runs[f"torch, {search}"] = {k: v[:limit] for k, v in answer.items()
                                                 if isinstance(v, list)}  # fmt: skip
+            data = (prepare_kernels(network, low.shape), targets, jnp.asarray(low))
             # Jitted line searches hold the network many times over: minutes to compile.
             for method in METHODS if network_name == "random" else ("lbfgs",):
                 runs[f"jaxface, {method}"] = ours(
                     energy,
                     jnp.zeros_like(start),
-                    (prepare_kernels(network, low.shape), targets, jnp.asarray(low)),
+                    data,
                     method,
                     limit,
                 )
