@@ -165,7 +165,7 @@ def test_digitize_demo_then_a_folder_that_resumes(tmp_path):
     names = (
         "mesh.obj", "mesh.glb", "fit.npz", "albedo_partial.exr", "albedo_partial.png",
         "visibility.png", "overlay.png", "report.html", "report.json", "albedo.exr",
-        "albedo.png", "blend.json", "grams.npz", "completion.png",
+        "albedo.png", "blend.json", "grams.npz", "completion.png", "face.png",
     )  # fmt: skip
     assert not [n for n in names if not (tmp_path / "one" / n).is_file()]
     saved = read_fit(tmp_path / "one" / "fit.npz")

@@ -5,13 +5,16 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from jaxface.geometry.uv import uv_layout
+from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.gltf import write_glb
 from jaxface.io.models import load_model
 from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.random_features import random_network
+from jaxface.models.skin.regions import skin_fields
 from jaxface.pipeline.completing import CompletionSettings, complete
 from jaxface.pipeline.completion_files import _Checkpoint, open_database, parse_settings
 from jaxface.pipeline.completion_levels import OUTLINE, faded, level_steps, shrink
@@ -125,6 +128,25 @@ def test_hidden_detail_is_as_strong_as_what_the_photo_shows(model, base, databas
         strength[match] = grain(found, right) / grain(coarse.photo, left)
     assert strength[False] < 0.9
     assert abs(np.log(strength[True])) < 0.5 * abs(np.log(strength[False]))
+
+
+def test_hair_across_one_brow_is_not_its_own(model, base):
+    """Both brows may be dark; one alone may be a little darker than the other."""
+    layout = uv_layout(model.uv, model.uv_faces, SIZE)
+    brow = np.asarray(layout(skin_fields(model).regions.brow[:, None], model.faces, 0.0))[..., 0]
+    wide = np.clip(3 * gaussian_filter(brow, 2), 0, 1)
+    right = np.arange(SIZE) > SIZE // 2
+    plain, weight = np.zeros(model.albedo.count, np.float32), np.float32(layout.inside)
+
+    def darkness(where):
+        albedo = base * np.exp(-0.7 * (wide * where))[..., None]
+        photo = srgb_to_linear(seen_texture(model, albedo, weight, plain, 1.0).photo)
+        middle = (wide > 0.9) & right
+        return -np.log(np.asarray(photo)[middle] / base[middle]).mean()
+
+    both, one = darkness(np.ones(SIZE)), darkness(right)
+    assert both > 0.5
+    assert 0.05 < one < 0.6 * both
 
 
 def test_eyes_and_mouth_are_left_alone(completed, seen):

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.camera import Camera, Pose
-from jaxface.render.image import render
+from jaxface.imaging.mipmap import mipmap
+from jaxface.render.image import render, render_textured
+from jaxface.render.shading import ambient_light
 
 HEIGHT, WIDTH = 45, 61
 
@@ -84,3 +86,60 @@ def test_derivatives_of_the_picture_equal_differences(part, picture):
     scale = abs(difference) + 1e-3
     assert abs(forward - reverse) < 1e-9 * scale
     assert abs(forward - difference) < 1e-5 * scale
+
+
+def plane():
+    """A square of 20 mm in two triangles, 200 mm in front of a camera that it fills."""
+    corners = jnp.array([[-10.0, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]])
+    faces = jnp.array([[0, 1, 2], [0, 2, 3]])
+    uv = (corners[:, :2] + 10) / 20
+    return corners, faces, uv, Pose(jnp.zeros(3), jnp.array([0.0, 0, -200]))
+
+
+def textured(texture, side, focal, **more):
+    corners, faces, uv, pose = plane()
+    camera = Camera(jnp.asarray(focal), jnp.full(2, side / 2))
+    light = more.pop("light", ambient_light())
+    return render_textured(
+        corners, faces, texture, uv, faces, pose, camera, light, side, side, **more
+    )
+
+
+def test_a_texture_facing_the_camera_is_its_picture_pixel_for_pixel():
+    image = np.random.default_rng(3).uniform(0.1, 0.9, (32, 32, 3)).astype(np.float32)
+    drawn = textured(mipmap(jnp.asarray(image)), 32, 320.0)
+    assert bool(drawn.mask.all())
+    np.testing.assert_allclose(np.asarray(drawn.color), image, atol=2e-5)
+
+
+@pytest.mark.parametrize("shrunk", [2, 4])
+def test_a_texture_that_is_farther_away_is_averaged_and_does_not_alias(shrunk):
+    side = 32 // shrunk
+    image = np.random.default_rng(4).uniform(0.1, 0.9, (32, 32, 3)).astype(np.float32)
+    drawn = textured(mipmap(jnp.asarray(image)), side, 320.0 / shrunk)
+    blocks = image.reshape(side, shrunk, side, shrunk, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(np.asarray(drawn.color), blocks, atol=2e-5)
+
+
+def test_occlusion_takes_its_share_of_the_light():
+    image = jnp.full((8, 8, 3), 0.5)
+    light = ambient_light(2.0)
+    half = jnp.zeros((4, 9)).at[:, 0].set(-0.5 / light[0, 0])
+    drawn = textured(mipmap(image), 8, 80.0, light=light, occlusion=half)
+    np.testing.assert_allclose(np.asarray(drawn.color), 0.5 * 1.5, rtol=1e-5)
+
+
+def test_derivative_in_the_texture_equals_differences_in_both_modes():
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(5)
+        image, step = jnp.asarray(rng.uniform(0.1, 0.9, (2, 16, 16, 3)))
+        weights = jnp.asarray(rng.normal(size=(12, 12, 3)))
+
+        def loss(texture):
+            return jnp.sum(weights * textured(mipmap(texture), 12, 100.0).color)
+
+        difference = float(loss(image + 1e-5 * step) - loss(image - 1e-5 * step)) / 2e-5
+        forward = float(jax.jvp(loss, (image,), (step,))[1])
+        reverse = float(jnp.vdot(jax.grad(loss)(image), step))
+    assert abs(forward - difference) < 1e-7 * abs(difference)
+    assert abs(reverse - forward) < 1e-11 * abs(forward)

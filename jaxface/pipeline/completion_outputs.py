@@ -10,6 +10,7 @@ import numpy as np
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.atomic import atomic_path
 from jaxface.io.exr import write_exr
+from jaxface.io.fit_file import read_fit
 from jaxface.io.image import write_png
 from jaxface.io.overlay import contact_sheet
 from jaxface.io.report import write_report
@@ -17,6 +18,7 @@ from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.pipeline.completing import Completed
 from jaxface.pipeline.completion_levels import shrink
+from jaxface.pipeline.face_views import face_views
 from jaxface.pipeline.seen_texture import SeenTexture
 
 _FILES = {
@@ -25,6 +27,7 @@ _FILES = {
     "blend.json": "weights of the database's subjects, objective, certified gap",
     "grams.npz": "the Gram matrices that the synthesis was to match",
     "completion.png": "partial, low frequencies, neighbours, result, close-ups",
+    "face.png": "the face with its complete albedo from three sides, and close with no expression",
 }
 
 
@@ -73,6 +76,8 @@ def save_completed(
     with atomic_path(place / "blend.json") as temporary:
         temporary.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     write_png(place / "completion.png", _sheet(done, seen, textures, order))
+    views = face_views(seen.model, read_fit(place / "fit.npz").parameters, linear)
+    write_png(place / "face.png", contact_sheet(views, columns=2, heading="complete face"))
     if (place / "mesh.glb").is_file():
         retexture_glb(place / "mesh.glb", (place / "albedo.png").read_bytes())
     if (place / "mesh.mtl").is_file():
@@ -141,7 +146,8 @@ def _extend_report(
         fresh = {entry[column] for entry in new}
         return [e for e in report.get(key, []) if e.get(column) not in fresh] + new
 
-    images = [{"title": name, "file": name} for name in ("completion.png", "albedo.png")]
+    pictures = ("face.png", "completion.png", "albedo.png")
+    images = [{"title": name, "file": name} for name in pictures]
     report["images"] = joined("images", "file", images)
     report["files"] = joined(
         "files", "file", [{"file": name, "what": what} for name, what in _FILES.items()]

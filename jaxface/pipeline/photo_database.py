@@ -246,7 +246,7 @@ def _albedo(
     textured = texture(source.fitted(levels, light), layout.resolution)
     partial = textured.partial
     whole, borrowed = fill_from_mirror(
-        partial.albedo, partial.weight, textured.low_frequency, mirrored, layout
+        partial.albedo, partial.weight, textured.low_frequency, mirrored
     )
     inside = layout.triangle >= 0
     covered = jnp.maximum(jnp.sum(inside), 1)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter
 
-from jaxface._types import Bool, Float
+from jaxface._types import Array, Bool, Float
 from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.resample import resize
@@ -23,10 +23,13 @@ from jaxface.models.skin.regions import skin_fields
 from jaxface.models.subdivide import subdivide
 from jaxface.stages.fit.prepared import FACE_REGIONS
 from jaxface.stages.low_frequency import low_frequency_albedo
+from jaxface.stages.mirror_texture import mirror_uv, mirrored, with_other_side
 from jaxface.stages.plausible_skin import plausible_skin
-from jaxface.stages.symmetry import with_other_side
 
 NOT_SKIN = ("eyes", "mouth_interior")
+
+OTHER_BROW = 0.1
+"""by which one brow may be darker than the other, natural logarithm of the albedo"""
 
 
 @dataclass(frozen=True)
@@ -99,13 +102,12 @@ def seen_texture(
     weight = np.asarray(weight) * _off_openings(
         model, np.asarray(rims.pocket), layout, texels_per_pixel
     )
-    dark = _may_be_dark(model, layout, np.asarray(albedo), weight, np.asarray(base))
+    source = jnp.asarray(mirror_uv(model, layout))
+    dark = _may_be_dark(model, layout, np.asarray(albedo), weight, np.asarray(base), source)
     kept, trusted = plausible_skin(
         jnp.asarray(albedo), jnp.asarray(weight), base, jnp.asarray(dark)
     )
-    low = low_frequency_albedo(
-        *with_other_side(kept, trusted, model, layout), calm, model.faces, layout
-    )
+    low = low_frequency_albedo(*with_other_side(kept, trusted, source), calm, model.faces, layout)
     triangle = np.maximum(np.asarray(layout.triangle), 0)
     faces = np.asarray(model.faces)
     inside = np.asarray(layout.inside)
@@ -205,6 +207,7 @@ def _may_be_dark(
     albedo: Float[np.ndarray, "r r 3"],
     weight: Float[np.ndarray, "r r"],
     base: Float[np.ndarray, "r r 3"],
+    source: Float[Array, "r r 2"],
 ) -> Float[np.ndarray, "r r"]:
     """How much darker than its surroundings skin may be, beyond what `plausible_skin` lets pass.
 
@@ -232,10 +235,18 @@ def _may_be_dark(
         wide = np.clip(3 * gaussian_filter(brow, step), 0, 1)
         # At the outline of what is seen it is hair of the head that hangs in.
         outline = np.asarray(distance_transform_edt(~_largest_part(weight < 0.05)))
-        wide = wide * np.clip((outline / step - 1.5) / 3, 0, 1)
+        hair = 3.0 * wide * np.clip((outline / step - 1.5) / 3, 0, 1)
+        # One brow is about as dark as the other: what is darker by far is that hair's, or shadow.
+        tone = ratio - np.average(ratio, weights=np.maximum(weight, 1e-6))
+        seen = mirrored(jnp.asarray(tone[..., None]), jnp.asarray(weight, jnp.float32), source)
+        sums, share = (gaussian_filter(np.asarray(seen)[..., k], step / 2) for k in (0, 1))
+        other = -minimum_filter(sums / np.maximum(share, 0.1), round(3 * step))
+        known = np.clip(2 * share - 0.5, 0, 1)
+        darkest = known * np.maximum(other, 0) + (1 - known) * hair
+        hair = np.minimum(hair, gaussian_filter(darkest, step) + OTHER_BROW)
     else:
-        wide = 0.0
-    return 3.0 * wide + np.asarray(layout(jnp.asarray(smooth[:, None]), model.faces, 0.0))[..., 0]
+        hair = 0.0
+    return hair + np.asarray(layout(jnp.asarray(smooth[:, None]), model.faces, 0.0))[..., 0]
 
 
 def _largest_part(mask: Bool[np.ndarray, "r r"]) -> Bool[np.ndarray, "r r"]:

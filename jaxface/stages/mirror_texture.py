@@ -1,4 +1,8 @@
-"""A texture seen in the mirror: what the other half of a face shows, brought over."""
+"""A texture seen in the mirror: what one half of a face says of the other.
+
+The complexion of both halves is nearly the same. Where one is hidden, the other's is the best guess
+of its low frequencies.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +12,9 @@ from jaxface._types import Array, Float
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.resample import bilinear
 from jaxface.models.morphable import MorphableModel
+
+GUESS = 0.5
+"""trust in the other half's colour, of that in the half's own"""
 
 
 def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r 2"]:
@@ -53,12 +60,55 @@ def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r
     return result
 
 
+def mirrored(
+    values: Float[Array, "r r c"], weight: Float[Array, "r r"], source_uv: Float[Array, "r r 2"]
+) -> Float[Array, "r r d"]:
+    """What a texture's mirror image shows: values times weight, and the weight, 0 where nothing.
+
+    Args:
+        values: anything where ``weight`` is 0.
+        weight: how far each texel is to be trusted, 0 to 1.
+        source_uv: from ``mirror_uv``.
+
+    Returns:
+        One channel more than ``values`` has, premultiplied.
+    """
+    both = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
+    size = weight.shape[0]
+    known = jnp.all(jnp.isfinite(source_uv), axis=-1)[..., None]
+    place = jnp.where(known, source_uv, 0.0)
+    points = jnp.stack([place[..., 0], 1.0 - place[..., 1]], axis=-1) * size
+    return bilinear(both, points) * known
+
+
+def with_other_side(
+    albedo: Float[Array, "r r 3"], weight: Float[Array, "r r"], source_uv: Float[Array, "r r 2"]
+) -> tuple[Float[Array, "r r 3"], Float[Array, "r r"]]:
+    """A partial albedo and its weight, the other half's where a half is hidden.
+
+    For low frequencies alone: a copy of the other half's detail would be seen.
+
+    Args:
+        albedo: linear RGB, anything where ``weight`` is 0.
+        weight: how far each texel is to be trusted, 0 to 1.
+        source_uv: from ``mirror_uv``.
+
+    Returns:
+        Colours, and weights that are at most `GUESS` where the other half speaks.
+    """
+    other = mirrored(albedo, weight, source_uv)
+    guess = GUESS * (1 - weight)
+    # ``other`` is premultiplied: colour times the weight that the other half has there.
+    total = weight + guess * other[..., 3]
+    colour = albedo * weight[..., None] + guess[..., None] * other[..., :3]
+    return colour / jnp.maximum(total, 1e-6)[..., None], total
+
+
 def fill_from_mirror(
     albedo: Float[Array, "r r 3"],
     weight: Float[Array, "r r"],
     low_frequency: Float[Array, "r r 3"],
     source_uv: Float[Array, "r r 2"],
-    layout: UVLayout,
 ) -> tuple[Float[Array, "r r 3"], Float[Array, "r r"]]:
     """A whole texture: what is seen, else what its mirror image shows, else the low frequencies.
 
@@ -70,18 +120,12 @@ def fill_from_mirror(
         weight: how far each texel is to be trusted, 0 to 1.
         low_frequency: whole, linear RGB.
         source_uv: from ``mirror_uv``.
-        layout: of all of them.
 
     Returns:
         Linear RGB, and the weight of the mirror image in it.
     """
     detail = jnp.clip(albedo / jnp.maximum(low_frequency, 1e-4), 1 / 3, 3.0)
-    both = jnp.concatenate([detail * weight[..., None], weight[..., None]], axis=-1)
-    size = layout.resolution
-    known = jnp.all(jnp.isfinite(source_uv), axis=-1)
-    place = jnp.where(known[..., None], source_uv, 0.0)
-    points = jnp.stack([place[..., 0], 1.0 - place[..., 1]], axis=-1) * size
-    found = bilinear(both, points.reshape(-1, 2)).reshape(size, size, 4) * known[..., None]
+    found = mirrored(detail, weight, source_uv)
     trust = jnp.clip(found[..., 3], 0.0, 1.0)
     other = found[..., :3] / jnp.maximum(found[..., 3:], 1e-3)
     filled = low_frequency * (1 + trust[..., None] * (other - 1))

@@ -3,7 +3,7 @@ import numpy as np
 
 from jaxface.geometry.uv import uv_layout
 from jaxface.io.models import load_model
-from jaxface.stages.symmetry import GUESS, mirrored_texels, with_other_side
+from jaxface.stages.mirror_texture import GUESS, mirror_uv, with_other_side
 
 SIDE = 256
 
@@ -18,7 +18,7 @@ def face_and_layout():
 
 def test_mirror_image_of_the_mirror_image_is_the_texel():
     model, layout, cheeks = face_and_layout()
-    uv = mirrored_texels(model, layout)[cheeks]
+    uv = mirror_uv(model, layout)[cheeks]
     assert np.isfinite(uv).all()
     rows, columns = np.nonzero(cheeks)
     # The bundled layout is symmetric about its middle.
@@ -32,7 +32,9 @@ def test_hidden_side_gets_the_colour_of_the_other_and_the_seen_side_keeps_its_ow
     colour = np.linspace(0.2, 0.6, SIDE)[:, None, None] * np.array([1.0, 0.8, 0.6])
     albedo = np.where(left[..., None], np.broadcast_to(colour, (SIDE, SIDE, 3)), 7.0)
     found, weight = with_other_side(
-        jnp.asarray(albedo, jnp.float32), jnp.asarray(left, jnp.float32), model, layout
+        jnp.asarray(albedo, jnp.float32),
+        jnp.asarray(left, jnp.float32),
+        jnp.asarray(mirror_uv(model, layout)),
     )
     seen = cheeks & left
     hidden = cheeks & (np.arange(SIDE) > SIDE // 2 + 14)
