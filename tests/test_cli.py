@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+import jaxface
 from jaxface.cli import app
 from jaxface.io.fit_file import read_fit
 
@@ -44,6 +45,26 @@ def test_mistakes_end_with_code_2_and_one_line(tmp_path, arguments):
     assert answer.exit_code == 2, answer.output
     assert "Traceback" not in answer.output
     assert "error:" in answer.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--database", "nowhere"),
+        ("--features", "nobody"),
+        ("--resolution", "100"),
+        ("--iterations", "0"),
+    ],
+)
+def test_a_completion_that_cannot_be_is_told_before_the_fit(tmp_path, arguments):
+    answer = run("digitize", "demo", "-o", tmp_path / "out", *arguments)
+    assert answer.exit_code == 2, answer.output
+    assert "error:" in answer.output and "Traceback" not in answer.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_version():
+    assert run("--version").stdout.strip() == jaxface.__version__
 
 
 def test_not_a_photo(tmp_path):

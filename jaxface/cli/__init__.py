@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from jaxface import __version__
 from jaxface.cli import textures
 from jaxface.cli.console import bar, console, errors, progress, steps
 from jaxface.io.cache import enable_compilation_cache
@@ -23,6 +24,22 @@ app.add_typer(model_app, name="model")
 app.add_typer(textures.database_app, name="database")
 app.add_typer(textures.features_app, name="features")
 app.command("texture")(textures.texture)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _command(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+    ] = False,
+) -> None:
+    """Options of the command itself, without a subcommand."""
+
 
 PhotoArgument = Annotated[str, typer.Argument(help="Photo, folder of photos, or `demo`.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write into.")]

@@ -82,8 +82,7 @@ def complete(
         ValueError: the database has fewer than two subjects, or the photo shows no skin.
     """
     settings = settings or CompletionSettings()
-    if len(database) < 2:
-        raise ValueError(f"database {database.name!r} has {len(database)} subjects; 2 are needed")
+    check_subjects(database)
     work = _Work(seen, database, network, settings, on_progress, blending)
     blended = work.blend()
     order = np.argsort(-blended.weights)
@@ -108,6 +107,12 @@ def complete(
         work.box(work.levels[-1]),
         records,
     )
+
+
+def check_subjects(database: TextureDatabase) -> None:
+    """Raise a ValueError if a database has too few subjects to blend."""
+    if len(database) < 2:
+        raise ValueError(f"database {database.name!r} has {len(database)} subjects; 2 are needed")
 
 
 class _Maps(NamedTuple):

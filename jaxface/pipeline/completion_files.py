@@ -19,10 +19,17 @@ from jaxface.io.image import write_png
 from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase, databases_dir
 from jaxface.models.features import FeatureNetwork
-from jaxface.pipeline.completing import Completed, CompletionSettings, Level, complete
+from jaxface.models.morphable import MorphableModel
+from jaxface.pipeline.completing import (
+    Completed,
+    CompletionSettings,
+    Level,
+    check_subjects,
+    complete,
+)
 from jaxface.pipeline.completion_outputs import save_completed
 from jaxface.pipeline.programs import source_digest
-from jaxface.pipeline.seen_texture import SeenTexture, read_seen_texture
+from jaxface.pipeline.seen_texture import SMALLEST, SeenTexture, read_seen_texture
 from jaxface.pipeline.skin_database import PAINTING, synth_database
 from jaxface.stages.synthesise import SynthesisWeights
 
@@ -41,6 +48,10 @@ WORK_FOLDER = ".completion"
 OnStep = Callable[[str, int, int], None]
 
 
+def silent(what: str, done: int, of: int) -> None:
+    """Tell nobody of a step."""
+
+
 def complete_folder(
     folder: str | os.PathLike[str],
     *,
@@ -49,7 +60,7 @@ def complete_folder(
     resolution: int | None = None,
     settings: CompletionSettings | None = None,
     model: str | os.PathLike[str] | None = None,
-    on_step: OnStep = lambda what, done, of: None,
+    on_step: OnStep = silent,
 ) -> Completed:
     """Complete the albedo of a digitized photo, and write map, meshes, pictures and report.
 
@@ -100,11 +111,38 @@ def complete_folder(
     return done
 
 
+def check_inputs(
+    model: str | os.PathLike[str] | MorphableModel = PAINTED_MODEL,
+    resolution: int | None = None,
+    database: str | os.PathLike[str] | None = None,
+    features: str = "random",
+) -> None:
+    """Raise at once what `complete_folder` would raise once a photo is fitted.
+
+    Args:
+        model: that is to be fitted.
+        resolution: as for `complete_folder`.
+        database: likewise.
+        features: likewise.
+
+    Raises:
+        FileNotFoundError: database or weights are nowhere.
+        ValueError: they are damaged, the database is in other UVs or too small, or so is the
+            resolution.
+    """
+    if resolution is not None and resolution < SMALLEST:
+        raise ValueError(f"resolution is {resolution}; a completion needs {SMALLEST} or more")
+    load_network(features)
+    if database is not None:
+        known = model if isinstance(model, MorphableModel) else load_model(model)
+        check_subjects(TextureDatabase(database, known))
+
+
 def open_database(
     path: str | os.PathLike[str] | None,
     model: str | os.PathLike[str],
     resolution: int,
-    on_step: OnStep = lambda what, done, of: None,
+    on_step: OnStep = silent,
 ) -> TextureDatabase:
     """The database of a path; without one the procedural one, made where it is not there yet.
 

@@ -11,7 +11,15 @@ import numpy as np
 from jaxface.io.fit_file import read_fit
 from jaxface.io.image import Photo
 from jaxface.io.landmark_file import read_landmarks
-from jaxface.pipeline.completion_files import PAINTED_MODEL, OnStep, complete_folder
+from jaxface.io.model_file import bundled_models
+from jaxface.models.morphable import MorphableModel
+from jaxface.pipeline.completion_files import (
+    PAINTED_MODEL,
+    OnStep,
+    check_inputs,
+    complete_folder,
+    silent,
+)
 from jaxface.pipeline.fitting import FittedFace, as_photo, fit
 from jaxface.pipeline.saving import save_fit
 from jaxface.pipeline.texturing import texture
@@ -45,7 +53,7 @@ def digitize(
     with_texture: bool = True,
     complete: bool = False,
     completion: Mapping[str, Any] | None = None,
-    on_step: OnStep = lambda what, done, of: None,
+    on_step: OnStep = silent,
     title: str | None = None,
     landmarks_file: str | os.PathLike[str] | None = None,
     mask_file: str | os.PathLike[str] | None = None,
@@ -77,25 +85,34 @@ def digitize(
         options["landmarks"] = read_landmarks(landmarks_file).points
     if mask_file is not None:
         options["mask"] = read_mask(mask_file)
+    model = options.get("model", PAINTED_MODEL)
+    wanted = {k: v for k, v in (completion or {}).items() if k in ("database", "features")}
+    if complete and with_texture:
+        check_inputs(model, resolution, **wanted)
     fitted = fit(photo, **options)
     textured = texture(fitted, resolution) if with_texture else None
     save_fit(fitted, out, textured=textured, title=title or "photo")
     if complete and with_texture:
-        _complete(out, fitted.model.name, completion or {}, on_step)
+        _complete(out, fitted.model.name, model, completion or {}, on_step)
     return fitted
 
 
 def _complete(
-    out: str | os.PathLike[str], model: str, completion: Mapping[str, Any], on_step: OnStep
+    out: str | os.PathLike[str],
+    name: str,
+    model: str | os.PathLike[str] | MorphableModel,
+    completion: Mapping[str, Any],
+    on_step: OnStep,
 ) -> None:
-    if model != PAINTED_MODEL and completion.get("database") is None:
+    if name != PAINTED_MODEL and completion.get("database") is None:
         warnings.warn(
             f"the albedo is left partial: the procedural skins are painted for {PAINTED_MODEL!r}, "
-            f"and no database in the UVs of {model!r} is named",
+            f"and no database in the UVs of {name!r} is named",
             stacklevel=3,
         )
         return
-    complete_folder(out, on_step=on_step, **completion)
+    file = None if isinstance(model, MorphableModel) or name in bundled_models() else model
+    complete_folder(out, on_step=on_step, **{"model": file, **completion})
 
 
 class FolderEntry(NamedTuple):
@@ -160,8 +177,10 @@ def digitize_folder(
             continue
         try:
             if fitted:
-                model = str(read_fit(folder / "fit.npz").metadata["model"])
-                _complete(folder, model, options.get("completion") or {}, lambda what, i, n: None)
+                name = str(read_fit(folder / "fit.npz").metadata["model"])
+                model = options.get("model", PAINTED_MODEL)
+                told, given = options.get("on_step", silent), options.get("completion") or {}
+                _complete(folder, name, model, given, told)
                 yield FolderEntry(photo, folder, None, None)
                 continue
             yield FolderEntry(photo, folder, digitize(photo, folder, **options), None)

@@ -28,6 +28,9 @@ from jaxface.stages.plausible_skin import plausible_skin
 
 NOT_SKIN = ("eyes", "mouth_interior")
 
+SMALLEST = 256
+"""texels along a side at least"""
+
 OTHER_BROW = 0.1
 """by which one brow may be darker than the other, natural logarithm of the albedo"""
 
@@ -90,10 +93,10 @@ def seen_texture(
         ValueError: the texture is smaller than 256 texels along a side, or not square.
     """
     size = len(albedo)
-    if albedo.shape != (size, size, 3) or weight.shape != (size, size) or size < 256:
+    if albedo.shape != (size, size, 3) or weight.shape != (size, size) or size < SMALLEST:
         raise ValueError(
             f"the partial albedo is {albedo.shape[:2]}, its weight {weight.shape}; both need to be "
-            "square, 256 texels or more"
+            f"square, {SMALLEST} texels or more"
         )
     layout: UVLayout = uv_layout(model.uv, model.uv_faces, size)
     rims = opening_rims(model)
