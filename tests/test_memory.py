@@ -22,16 +22,41 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-@pytest.mark.skipif(
+RESIDENT = """
+import numpy as np
+from jaxface.io.memory import hand_back_freed_memory, keep_freed_memory
+
+def resident():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 // 1_000_000
+
+assert keep_freed_memory()
+large, later = np.ones(50_000_000), np.ones(1000)  # 400 MB, and what keeps the heap's end
+full = resident()
+del large
+kept = resident()
+hand_back_freed_memory()
+print(full, kept, resident())
+"""
+
+only_glibc = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc" or sys.platform != "linux", reason="glibc's own setting"
 )
+
+
+def output(script: str, *arguments: str) -> str:
+    command = [sys.executable, "-c", script, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+@only_glibc
 def test_a_program_finds_its_memory_again():
-    faults = {
-        mode: int(
-            subprocess.run(
-                [sys.executable, "-c", FAULTS, mode], capture_output=True, text=True, check=True
-            ).stdout
-        )
-        for mode in ("keep", "give back")
-    }
+    faults = {mode: int(output(FAULTS, mode)) for mode in ("keep", "give back")}
     assert faults["keep"] < 0.1 * faults["give back"]
+
+
+@only_glibc
+def test_what_was_kept_is_handed_back_when_asked():
+    full, kept, after = map(int, output(RESIDENT).split())
+    assert kept > full - 50
+    assert after < full - 350

@@ -1,5 +1,6 @@
 """What the commands show: progress while they work, errors in one line."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -35,12 +36,22 @@ def progress(text: str) -> Iterator[None]:
 
 @contextmanager
 def errors() -> Iterator[None]:
-    """What a user can mend is told in one line, with exit code 2 and no traceback."""
+    """What a user can mend is told in one line, with exit code 2 and no traceback.
+
+    What a user should know is told in one line too, and the work goes on.
+    """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = _told
+            yield
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
         console.print(f"[bold red]error:[/bold red] {error}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from error
+
+
+def _told(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+    text = str(message) if category is UserWarning else f"{category.__name__}: {message}"
+    console.print(f"[bold yellow]warning:[/bold yellow] {text}", highlight=False, soft_wrap=True)
 
 
 @contextmanager

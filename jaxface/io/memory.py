@@ -30,3 +30,13 @@ def keep_freed_memory() -> bool:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     mallopt = ctypes.CDLL(None).mallopt
     return bool(mallopt(_MMAP_MAX, 0)) and bool(mallopt(_TRIM_THRESHOLD, _NEVER))
+
+
+def hand_back_freed_memory() -> None:
+    """Hand back what is freed and kept: between two parts of a run that need other sizes.
+
+    Each part then starts with what is in use alone, and not with the holes that the last one left.
+    Does nothing where the C library is not glibc.
+    """
+    if platform.system() == "Linux" and platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)

@@ -14,6 +14,7 @@ from jaxface.energies.kept_detail import KnownDetail
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.imaging.push_pull import push_pull
 from jaxface.imaging.resample import resize
+from jaxface.io.memory import hand_back_freed_memory
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.feature_tiles import even_tile
 from jaxface.models.features import FeatureNetwork
@@ -90,6 +91,7 @@ def complete(
     records: list[dict[str, Any]] = []
     start, last = np.zeros(0, np.float32), Level(np.zeros((0, 0), np.float32), {}, {})
     for index, level in enumerate(work.levels):
+        hand_back_freed_memory()
         start = work.start(level, used[0])
         done = resumed(level)
         if done is None or done.image.shape != work.cut(start, level).shape[:2]:
@@ -311,6 +313,7 @@ class _Work:
         def on_step(step: int, value: float, image: Callable[[], Array]) -> None:
             self.on_progress(what, step, steps, lambda: self.compose(start, np.asarray(image())))
 
+        hand_back_freed_memory()
         found = synthesise(
             jnp.clip(first, 0.01, 0.99),
             problem,

@@ -16,6 +16,7 @@ from jaxface.io.atomic import atomic_path
 from jaxface.io.feature_weights import load_network, network_digest
 from jaxface.io.gram_cache import digest
 from jaxface.io.image import write_png
+from jaxface.io.memory import hand_back_freed_memory
 from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase, databases_dir
 from jaxface.models.features import FeatureNetwork
@@ -83,6 +84,7 @@ def complete_folder(
     """
     place, settings = Path(folder), settings or CompletionSettings()
     started = time.perf_counter()
+    hand_back_freed_memory()  # the fit's
     network = load_network(features)
     seen = read_seen_texture(place, resolution, model)
     # Complete, if smooth: a first look while the database is painted and compared.

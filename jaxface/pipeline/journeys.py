@@ -92,6 +92,7 @@ def digitize(
     fitted = fit(photo, **options)
     textured = texture(fitted, resolution) if with_texture else None
     save_fit(fitted, out, textured=textured, title=title or "photo")
+    del textured
     if complete and with_texture:
         _complete(out, fitted.model.name, model, completion or {}, on_step)
     return fitted

@@ -4,6 +4,7 @@ The complexion of both halves is nearly the same. Where one is hidden, the other
 of its low frequencies.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,6 +16,9 @@ from jaxface.models.morphable import MorphableModel
 
 GUESS = 0.5
 """trust in the other half's colour, of that in the half's own"""
+
+ROWS = 128
+"""of a texture that are computed at once"""
 
 
 def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r 2"]:
@@ -37,26 +41,32 @@ def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r
     partner = np.asarray(tree.query(mirrored)[1])
 
     triangle = np.asarray(layout.triangle)
-    present = triangle >= 0
-    b, c = np.asarray(layout.barycentric, np.float64)[present].T
-    own = triangle[present]
-    point = (corners[own, 0] + b[:, None] * edge[own, 0] + c[:, None] * edge[own, 1]) * flip
-    other = partner[own]
-    first, second = edge[other, 0], edge[other, 1]
-    offset = point - corners[other, 0]
-    aa, ab, bb = (
-        np.sum(p * q, axis=1) for p, q in ((first, first), (first, second), (second,) * 2)
-    )
-    oa, ob = np.sum(offset * first, axis=1), np.sum(offset * second, axis=1)
-    determinant = np.maximum(aa * bb - ab * ab, 1e-12)
-    # Beyond its partner's edge a point is on a neighbour; farther it has no partner.
-    weights = [(bb * oa - ab * ob) / determinant, (aa * ob - ab * oa) / determinant]
-    on_b, on_c = (np.clip(w, -1.0, 2.0)[:, None] for w in weights)
-    uv = np.asarray(model.uv, np.float64)[uv_faces[other]]
-    found = uv[:, 0] * (1 - on_b - on_c) + uv[:, 1] * on_b + uv[:, 2] * on_c
-    near = np.abs(weights[0] - 0.5) + np.abs(weights[1] - 0.5) < 3.0
+    uv = np.asarray(model.uv, np.float64)
     result = np.full((*triangle.shape, 2), np.nan, np.float32)
-    result[present] = np.where(near[:, None], found, np.nan)
+
+    def rows(part: slice) -> None:
+        present = triangle[part] >= 0
+        b, c = np.asarray(layout.barycentric[part], np.float64)[present].T
+        own = triangle[part][present]
+        other = partner[own]
+        point = (corners[own, 0] + b[:, None] * edge[own, 0] + c[:, None] * edge[own, 1]) * flip
+        first, second = edge[other, 0], edge[other, 1]
+        offset = point - corners[other, 0]
+        aa, ab, bb = (
+            np.sum(p * q, axis=1) for p, q in ((first, first), (first, second), (second,) * 2)
+        )
+        oa, ob = np.sum(offset * first, axis=1), np.sum(offset * second, axis=1)
+        determinant = np.maximum(aa * bb - ab * ab, 1e-12)
+        # Beyond its partner's edge a point is on a neighbour; farther it has no partner.
+        weights = [(bb * oa - ab * ob) / determinant, (aa * ob - ab * oa) / determinant]
+        on_b, on_c = (np.clip(w, -1.0, 2.0)[:, None] for w in weights)
+        at = uv[uv_faces[other]]
+        found = at[:, 0] * (1 - on_b - on_c) + at[:, 1] * on_b + at[:, 2] * on_c
+        near = np.abs(weights[0] - 0.5) + np.abs(weights[1] - 0.5) < 3.0
+        result[part][present] = np.where(near[:, None], found, np.nan)
+
+    for start in range(0, len(triangle), ROWS):  # some at a time: two dozen arrays are in use
+        rows(slice(start, start + ROWS))
     return result
 
 
@@ -75,10 +85,14 @@ def mirrored(
     """
     both = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
     size = weight.shape[0]
-    known = jnp.all(jnp.isfinite(source_uv), axis=-1)[..., None]
-    place = jnp.where(known, source_uv, 0.0)
-    points = jnp.stack([place[..., 0], 1.0 - place[..., 1]], axis=-1) * size
-    return bilinear(both, points) * known
+
+    def row(uv: Float[Array, "r 2"]) -> Float[Array, "r d"]:
+        known = jnp.all(jnp.isfinite(uv), axis=-1)[:, None]
+        place = jnp.where(known, uv, 0.0)
+        points = jnp.stack([place[:, 0], 1.0 - place[:, 1]], axis=-1) * size
+        return bilinear(both, points) * known
+
+    return jax.lax.map(row, source_uv, batch_size=ROWS)
 
 
 def with_other_side(
