@@ -23,12 +23,13 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 RESIDENT = """
+import os
 import numpy as np
 from jaxface.io.memory import hand_back_freed_memory, keep_freed_memory
 
 def resident():
     with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * 4096 // 1_000_000
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1_000_000
 
 assert keep_freed_memory()
 large, later = np.ones(50_000_000), np.ones(1000)  # 400 MB, and what keeps the heap's end
