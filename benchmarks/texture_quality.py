@@ -243,7 +243,9 @@ def main() -> None:
     facts = dict(provenance(), side=options.side, iterations=options.iterations)
     # Sizes do not mix in one table: an octave of texels is another one of millimetres.
     size = "" if options.side == SIDE else f"_{options.side}"
-    path = options.output / f"texture_quality{size}.json"
+    # Nor do runs of the few steps that rank choices, and of the many that the command takes.
+    steps = f"_{options.iterations}_steps" if options.iterations > ITERATIONS else ""
+    path = options.output / f"texture_quality{size}{steps}.json"
 
     def keep(group: str, name: str, values: dict[str, float]) -> None:
         write_results(path, group, name, values, facts)

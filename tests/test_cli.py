@@ -1,14 +1,17 @@
 """The command line as a user types it."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 from typer.testing import CliRunner
 
 import jaxface
 from jaxface.cli import app
+from jaxface.cli.console import errors
 from jaxface.io.fit_file import read_fit
 
 runner = CliRunner()
@@ -61,6 +64,14 @@ def test_a_completion_that_cannot_be_is_told_before_the_fit(tmp_path, arguments)
     assert answer.exit_code == 2, answer.output
     assert "error:" in answer.output and "Traceback" not in answer.output
     assert not (tmp_path / "out").exists()
+
+
+def test_warnings_and_errors_are_one_line_with_their_brackets(capsys):
+    with pytest.raises(typer.Exit), errors():
+        warnings.warn("layer [float32] of [/a/b]", stacklevel=1)
+        raise ValueError("shape is [1, 2]")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["warning: layer [float32] of [/a/b]", "error: shape is [1, 2]"]
 
 
 def test_version():

@@ -9,17 +9,24 @@ from scipy.ndimage import gaussian_filter
 
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
+from jaxface.io.fit_file import write_fit
 from jaxface.io.gltf import write_glb
 from jaxface.io.models import load_model
 from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
+from jaxface.models.parameters import neutral_parameters
 from jaxface.models.random_features import random_network
 from jaxface.models.skin.regions import skin_fields
 from jaxface.pipeline.completing import CompletionSettings, complete
-from jaxface.pipeline.completion_files import _Checkpoint, open_database, parse_settings
+from jaxface.pipeline.completion_files import (
+    _Checkpoint,
+    check_inputs,
+    open_database,
+    parse_settings,
+)
 from jaxface.pipeline.completion_levels import OUTLINE, faded, level_steps, shrink
 from jaxface.pipeline.completion_records import Level
-from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
+from jaxface.pipeline.seen_texture import model_of, read_seen_texture, seen_texture
 
 SIZE = 256
 LAYERS = ("conv1_1", "conv2_1", "conv3_1")
@@ -215,7 +222,40 @@ def test_wrong_input_is_named(seen, database, network, model, tmp_path):
     with pytest.raises(FileNotFoundError, match="jaxface digitize"):
         read_seen_texture(tmp_path)
     with pytest.raises(ValueError, match="name a database"):
-        open_database(None, "other.npz", SIZE)
+        open_database(None, dataclasses.replace(model, name="other"), SIZE)
+
+
+def test_what_cannot_be_completed_is_told_beforehand(database, model, tmp_path):
+    check_inputs(model, SIZE, database.path)
+    check_inputs(dataclasses.replace(model, name="other"), SIZE, database.path)
+    with pytest.raises(ValueError, match="256 or more"):
+        check_inputs(model, SIZE - 1, database.path)
+    with pytest.raises(ValueError, match="1 subjects; 2 are needed"):
+        alone = TextureDatabase.create(tmp_path, model, SIZE, name="alone", licence="CC0-1.0")
+        alone.write_subject("s", np.full((SIZE, SIZE, 3), 0.5))
+        check_inputs(model, SIZE, tmp_path)
+    with pytest.raises(ValueError, match="UV"):
+        check_inputs(dataclasses.replace(model, uv=model.uv[::-1]), SIZE, database.path)
+
+
+def test_a_fit_of_another_model_is_named(model, tmp_path):
+    def fitted(face, name):
+        write_fit(tmp_path / "fit.npz", neutral_parameters(face), {}, {"model": name})
+
+    fitted(model, "makehuman")
+    assert model_of(tmp_path) is not None and model_of(tmp_path, model) is model
+    fitted(model, "other")
+    other = dataclasses.replace(model, name="other")
+    assert model_of(tmp_path, other) is other
+    with pytest.raises(ValueError, match="--model"):
+        model_of(tmp_path)
+    with pytest.raises(ValueError, match="'other'.*not with 'makehuman'"):
+        model_of(tmp_path, model)
+    fewer = dataclasses.replace(model.identity, basis=model.identity.basis[..., :5])
+    fewer = dataclasses.replace(fewer, std=model.identity.std[:5])
+    fitted(dataclasses.replace(other, identity=fewer), "other")
+    with pytest.raises(ValueError, match=r"of \[5, .*not with 'other'"):
+        model_of(tmp_path, other)
 
 
 @pytest.mark.parametrize(

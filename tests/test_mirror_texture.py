@@ -3,9 +3,9 @@ import numpy as np
 
 from jaxface.geometry.uv import uv_layout
 from jaxface.io.models import load_model
-from jaxface.stages.mirror_texture import GUESS, mirror_uv, with_other_side
+from jaxface.stages.mirror_texture import GUESS, ROWS, fill_from_mirror, mirror_uv, with_other_side
 
-SIDE = 256
+SIDE = 300  # not a multiple of the rows that are computed at once
 
 
 def face_and_layout():
@@ -24,6 +24,23 @@ def test_mirror_image_of_the_mirror_image_is_the_texel():
     # The bundled layout is symmetric about its middle.
     np.testing.assert_allclose(uv[:, 0], 1 - (columns + 0.5) / SIDE, atol=1.5 / SIDE)
     np.testing.assert_allclose(uv[:, 1], 1 - (rows + 0.5) / SIDE, atol=1.5 / SIDE)
+
+
+def test_a_hidden_half_gets_the_others_detail_on_its_own_low_frequencies():
+    model, layout, cheeks = face_and_layout()
+    assert SIDE % ROWS
+    left = np.broadcast_to(np.arange(SIDE) < SIDE // 2 - 10, (SIDE, SIDE))
+    stripes = 1 + 0.2 * np.sin(np.arange(SIDE) / 6)[:, None, None]
+    low = np.where(left[..., None], 0.4, 0.3) * np.array([1.0, 0.8, 0.6])
+    albedo = np.where(left[..., None], stripes * low, 9.0)
+    arrays = (jnp.asarray(x, jnp.float32) for x in (albedo, left, low, mirror_uv(model, layout)))
+    whole, borrowed = map(np.asarray, fill_from_mirror(*arrays))
+    seen = cheeks & left
+    hidden = cheeks & (np.arange(SIDE) > SIDE // 2 + 14)
+    np.testing.assert_allclose(whole[seen], albedo[seen], rtol=1e-5)
+    np.testing.assert_allclose(whole[hidden], (stripes * low)[hidden], atol=0.01)
+    np.testing.assert_allclose(borrowed[hidden], 1.0, atol=1e-3)
+    assert not borrowed[seen].any()
 
 
 def test_hidden_side_gets_the_colour_of_the_other_and_the_seen_side_keeps_its_own():

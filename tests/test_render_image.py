@@ -8,7 +8,7 @@ import pytest
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.imaging.mipmap import mipmap
 from jaxface.render.image import render, render_textured
-from jaxface.render.shading import ambient_light
+from jaxface.render.shading import ambient_light, sh_basis
 
 HEIGHT, WIDTH = 45, 61
 
@@ -121,25 +121,67 @@ def test_a_texture_that_is_farther_away_is_averaged_and_does_not_alias(shrunk):
     np.testing.assert_allclose(np.asarray(drawn.color), blocks, atol=2e-5)
 
 
-def test_occlusion_takes_its_share_of_the_light():
+def test_occlusion_is_taken_in_the_frame_of_the_mesh():
+    """A light from the camera's right, hidden from the mesh's own right, which is turned up."""
     image = jnp.full((8, 8, 3), 0.5)
-    light = ambient_light(2.0)
-    half = jnp.zeros((4, 9)).at[:, 0].set(-0.5 / light[0, 0])
-    drawn = textured(mipmap(image), 8, 80.0, light=light, occlusion=half)
-    np.testing.assert_allclose(np.asarray(drawn.color), 0.5 * 1.5, rtol=1e-5)
+    light = ambient_light(2.0) + 0.3 * jnp.asarray(sh_basis(jnp.array([1.0, 0, 0])))[:, None]
+    corners, faces, uv, pose = plane()
+    quarter = Pose(jnp.array([0.0, 0.0, np.pi / 2]), pose.translation)
+    # The light of the camera's right comes, seen from the turned mesh, from below.
+    below, right = (sh_basis(jnp.array(d)) for d in ([0.0, -1, 0], [1.0, 0, 0]))
+    camera = Camera(jnp.asarray(80.0), jnp.full(2, 4.0))
+
+    def drawn(hidden):
+        occlusion = -0.2 * jnp.tile(hidden, (4, 1))
+        return render_textured(
+            corners, faces, mipmap(image), uv, faces, quarter, camera, light, 8, 8,
+            occlusion=occlusion,
+        ).color  # fmt: skip
+
+    toward = 0.2 * float(right @ light[:, 0])
+    plain = render_textured(
+        corners, faces, mipmap(image), uv, faces, quarter, camera, light, 8, 8
+    ).color
+    np.testing.assert_allclose(np.asarray(plain - drawn(below)), 0.5 * toward, rtol=1e-4)
+    assert np.abs(np.asarray(drawn(right) - drawn(below))).min() > 0.01
 
 
-def test_derivative_in_the_texture_equals_differences_in_both_modes():
+@pytest.mark.parametrize("side", [16, 256])
+def test_derivatives_of_the_textured_picture_equal_differences(side):
+    """On one triangle of 80 pixels that fills the picture: magnified, and from the mipmap."""
     with jax.enable_x64(True):
         rng = np.random.default_rng(5)
-        image, step = jnp.asarray(rng.uniform(0.1, 0.9, (2, 16, 16, 3)))
+        faces, uv = jnp.array([[0, 1, 2]]), jnp.array([[0.0, 0.1], [1.0, 0.0], [0.6, 1.0]])
+        coarse = jnp.asarray(rng.uniform(0.1, 0.9, (9, 9, 3)))
+        inputs = {
+            "texture": jax.image.resize(coarse, (side, side, 3), "cubic"),
+            "vertices": jnp.array([[-90.0, -60, 0], [90, -60, -15], [0, 130, 10]]),
+            "pose": Pose(jnp.array([0.1, -0.2, 0.05]), jnp.array([2.0, -3.0, -200.0])),
+            "camera": Camera(jnp.asarray(90.0), jnp.array([6.2, 5.9])),
+            "light": jnp.asarray(rng.normal(0, 0.2, (9, 3))).at[0].add(2.5),
+        }
         weights = jnp.asarray(rng.normal(size=(12, 12, 3)))
 
-        def loss(texture):
-            return jnp.sum(weights * textured(mipmap(texture), 12, 100.0).color)
+        @jax.jit
+        def loss(values):
+            drawn = render_textured(
+                values["vertices"], faces, mipmap(values["texture"]), uv, faces, values["pose"],
+                values["camera"], values["light"], 12, 12,
+            )  # fmt: skip
+            return jnp.sum(weights * drawn.color)
 
-        difference = float(loss(image + 1e-5 * step) - loss(image - 1e-5 * step)) / 2e-5
-        forward = float(jax.jvp(loss, (image,), (step,))[1])
-        reverse = float(jnp.vdot(jax.grad(loss)(image), step))
-    assert abs(forward - difference) < 1e-7 * abs(difference)
-    assert abs(reverse - forward) < 1e-11 * abs(forward)
+        forward = jax.jit(lambda step: jax.jvp(loss, (inputs,), (step,))[1])
+        slope = jax.jit(jax.grad(loss))(inputs)
+        for part, value in inputs.items():
+            size = {"pose": 1e-3, "camera": 0.1}.get(part, 1.0)
+            random = jax.tree.map(lambda v, k=size: k * rng.normal(size=v.shape), value)
+            step = {**jax.tree.map(jnp.zeros_like, inputs), part: random}
+            ahead, behind = (
+                float(loss(jax.tree.map(lambda v, s, k=h: v + k * s, inputs, step)))
+                for h in (1e-5, -1e-5)
+            )
+            difference, along = (ahead - behind) / 2e-5, float(forward(step))
+            pairs = zip(jax.tree.leaves(slope), jax.tree.leaves(step), strict=True)
+            reverse = sum(float(jnp.vdot(g, s)) for g, s in pairs)
+            assert abs(along - difference) < 1e-5 * (abs(difference) + 1e-3), part
+            assert abs(reverse - along) < 1e-10 * (abs(along) + 1e-3), part

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -45,13 +46,18 @@ def errors() -> Iterator[None]:
             warnings.showwarning = _told
             yield
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        console.print(f"[bold red]error:[/bold red] {error}", highlight=False, soft_wrap=True)
+        _tell("[bold red]error:[/bold red]", str(error))
         raise typer.Exit(2) from error
 
 
 def _told(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
     text = str(message) if category is UserWarning else f"{category.__name__}: {message}"
-    console.print(f"[bold yellow]warning:[/bold yellow] {text}", highlight=False, soft_wrap=True)
+    _tell("[bold yellow]warning:[/bold yellow]", text)
+
+
+def _tell(kind: str, text: str) -> None:
+    # Square brackets of a message are its own, not markup.
+    console.print(f"{kind} {escape(text)}", highlight=False, soft_wrap=True)
 
 
 @contextmanager

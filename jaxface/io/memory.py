@@ -8,6 +8,7 @@ import jax
 # <malloc.h> of glibc
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 _NEVER = 2**31 - 1
+_GLIBC = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"
 
 
 def keep_freed_memory() -> bool:
@@ -25,7 +26,7 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether anything was changed: False on other systems and C libraries.
     """
-    if platform.system() != "Linux" or platform.libc_ver()[0] != "glibc":
+    if not _GLIBC:
         return False
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     mallopt = ctypes.CDLL(None).mallopt
@@ -38,5 +39,5 @@ def hand_back_freed_memory() -> None:
     Each part then starts with what is in use alone, and not with the holes that the last one left.
     Does nothing where the C library is not glibc.
     """
-    if platform.system() == "Linux" and platform.libc_ver()[0] == "glibc":
+    if _GLIBC:
         ctypes.CDLL(None).malloc_trim(0)

@@ -17,7 +17,6 @@ from jaxface.io.feature_weights import load_network, network_digest
 from jaxface.io.gram_cache import digest
 from jaxface.io.image import write_png
 from jaxface.io.memory import hand_back_freed_memory
-from jaxface.io.models import load_model
 from jaxface.io.texture_database import TextureDatabase, databases_dir
 from jaxface.models.features import FeatureNetwork
 from jaxface.models.morphable import MorphableModel
@@ -30,7 +29,7 @@ from jaxface.pipeline.completing import (
 )
 from jaxface.pipeline.completion_outputs import save_completed
 from jaxface.pipeline.programs import source_digest
-from jaxface.pipeline.seen_texture import SMALLEST, SeenTexture, read_seen_texture
+from jaxface.pipeline.seen_texture import SMALLEST, SeenTexture, model_of, read_seen_texture
 from jaxface.pipeline.skin_database import PAINTING, synth_database
 from jaxface.stages.synthesise import SynthesisWeights
 
@@ -60,7 +59,7 @@ def complete_folder(
     features: str = "random",
     resolution: int | None = None,
     settings: CompletionSettings | None = None,
-    model: str | os.PathLike[str] | None = None,
+    model: str | os.PathLike[str] | MorphableModel | None = None,
     on_step: OnStep = silent,
 ) -> Completed:
     """Complete the albedo of a digitized photo, and write map, meshes, pictures and report.
@@ -75,7 +74,7 @@ def complete_folder(
         features: name or file of the feature network, see `load_network`.
         resolution: texels along a side; as the partial albedo has by default.
         settings: see `CompletionSettings`.
-        model: file of the model, where the fit is not of a bundled one.
+        model: the model or its file, where the fit is not of a bundled one.
         on_step: told of every step.
 
     Raises:
@@ -86,10 +85,11 @@ def complete_folder(
     started = time.perf_counter()
     hand_back_freed_memory()  # the fit's
     network = load_network(features)
-    seen = read_seen_texture(place, resolution, model)
+    face = model_of(place, model)
+    seen = read_seen_texture(place, resolution, face)
     # Complete, if smooth: a first look while the database is painted and compared.
     write_png(place / "albedo_preview.png", seen.low_frequency)
-    textures = open_database(database, model or seen.model.name, seen.resolution, on_step)
+    textures = open_database(database, face, seen.resolution, on_step)
     work = _Checkpoint(place, settings, network, textures, seen)
     shown = -PREVIEW_SECONDS  # the first picture is shown at once
 
@@ -114,8 +114,8 @@ def complete_folder(
 
 
 def check_inputs(
-    model: str | os.PathLike[str] | MorphableModel = PAINTED_MODEL,
-    resolution: int | None = None,
+    model: MorphableModel,
+    resolution: int,
     database: str | os.PathLike[str] | None = None,
     features: str = "random",
 ) -> None:
@@ -132,17 +132,16 @@ def check_inputs(
         ValueError: they are damaged, the database is in other UVs or too small, or so is the
             resolution.
     """
-    if resolution is not None and resolution < SMALLEST:
+    if resolution < SMALLEST:
         raise ValueError(f"resolution is {resolution}; a completion needs {SMALLEST} or more")
     load_network(features)
     if database is not None:
-        known = model if isinstance(model, MorphableModel) else load_model(model)
-        check_subjects(TextureDatabase(database, known))
+        check_subjects(TextureDatabase(database, model))
 
 
 def open_database(
     path: str | os.PathLike[str] | None,
-    model: str | os.PathLike[str],
+    model: MorphableModel,
     resolution: int,
     on_step: OnStep = silent,
 ) -> TextureDatabase:
@@ -153,10 +152,10 @@ def open_database(
         ValueError: it is in the UVs of another model, or there is none for this model.
     """
     if path is not None:
-        return TextureDatabase(path, load_model(model))
-    if str(model) != PAINTED_MODEL:
+        return TextureDatabase(path, model)
+    if model.name != PAINTED_MODEL:
         raise ValueError(
-            f"the procedural skins are painted for {PAINTED_MODEL!r}, not for {str(model)!r}; name "
+            f"the procedural skins are painted for {PAINTED_MODEL!r}, not for {model.name!r}; name "
             "a database in this model's UVs"
         )
     size = min(resolution, LARGEST_DATABASE)

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxface.io.fit_file import read_fit
 from jaxface.io.image import Photo
 from jaxface.io.landmark_file import read_landmarks
-from jaxface.io.model_file import bundled_models
+from jaxface.io.models import load_model
 from jaxface.models.morphable import MorphableModel
 from jaxface.pipeline.completion_files import (
     PAINTED_MODEL,
@@ -75,9 +74,32 @@ def digitize(
         options: passed to ``fit``.
 
     Raises:
-        ValueError: as ``fit``.
+        ValueError: as ``fit``, or no completion can be as it is asked for (before the fit).
         FileNotFoundError: a file that does not exist.
     """
+    options["model"] = model = _loaded(options)
+    completing = complete and with_texture and _can_complete(model, resolution, completion or {})
+    return _digitize(
+        photo, out, completion or {}, completing, resolution=resolution, with_texture=with_texture,
+        on_step=on_step, title=title, landmarks_file=landmarks_file, mask_file=mask_file,
+        **options,
+    )  # fmt: skip
+
+
+def _digitize(
+    photo: str | os.PathLike[str] | Photo | np.ndarray,
+    out: str | os.PathLike[str],
+    completion: Mapping[str, Any],
+    completing: bool,
+    *,
+    resolution: int = 2048,
+    with_texture: bool = True,
+    on_step: OnStep = silent,
+    title: str | None = None,
+    landmarks_file: str | os.PathLike[str] | None = None,
+    mask_file: str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> FittedFace:
     if isinstance(photo, str | os.PathLike):
         title = title or (DEMO if str(photo) == DEMO else Path(photo).stem)
         photo = open_photo(photo)
@@ -85,35 +107,38 @@ def digitize(
         options["landmarks"] = read_landmarks(landmarks_file).points
     if mask_file is not None:
         options["mask"] = read_mask(mask_file)
-    model = options.get("model", PAINTED_MODEL)
-    wanted = {k: v for k, v in (completion or {}).items() if k in ("database", "features")}
-    if complete and with_texture:
-        check_inputs(model, resolution, **wanted)
     fitted = fit(photo, **options)
     textured = texture(fitted, resolution) if with_texture else None
     save_fit(fitted, out, textured=textured, title=title or "photo")
     del textured
-    if complete and with_texture:
-        _complete(out, fitted.model.name, model, completion or {}, on_step)
+    if completing:
+        complete_folder(out, on_step=on_step, **{"model": options["model"], **completion})
     return fitted
 
 
-def _complete(
-    out: str | os.PathLike[str],
-    name: str,
-    model: str | os.PathLike[str] | MorphableModel,
-    completion: Mapping[str, Any],
-    on_step: OnStep,
-) -> None:
-    if name != PAINTED_MODEL and completion.get("database") is None:
+def _loaded(options: Mapping[str, Any]) -> MorphableModel:
+    model = options.get("model", PAINTED_MODEL)
+    return model if isinstance(model, MorphableModel) else load_model(model)
+
+
+def _can_complete(model: MorphableModel, resolution: int, completion: Mapping[str, Any]) -> bool:
+    """Whether a completion can follow the fit, told before hours are spent.
+
+    Raises:
+        ValueError: as `check_inputs`.
+        FileNotFoundError: likewise.
+    """
+    database = completion.get("database")
+    if model.name != PAINTED_MODEL and database is None:
         warnings.warn(
             f"the albedo is left partial: the procedural skins are painted for {PAINTED_MODEL!r}, "
-            f"and no database in the UVs of {name!r} is named",
+            f"and no database in the UVs of {model.name!r} is named",
             stacklevel=3,
         )
-        return
-    file = None if isinstance(model, MorphableModel) or name in bundled_models() else model
-    complete_folder(out, on_step=on_step, **{"model": file, **completion})
+        return False
+    side = completion.get("resolution") or resolution
+    check_inputs(model, side, database, completion.get("features", "random"))
+    return True
 
 
 class FolderEntry(NamedTuple):
@@ -164,26 +189,24 @@ def digitize_folder(
         options: passed to ``digitize``.
 
     Raises:
-        ValueError: two photos would share a folder.
+        ValueError: two photos would share a folder, or no completion can be as it is asked for.
+        FileNotFoundError: there is no such model, database or file of weights.
     """
     folders = [Path(out) / photo.stem for photo in photos]
     if len(set(folders)) < len(folders):
         raise ValueError("photos whose names differ only in the suffix would share a folder")
+    completion, complete = options.pop("completion", None) or {}, options.pop("complete", False)
+    with_texture, resolution = options.get("with_texture", True), options.get("resolution", 2048)
+    options["model"] = model = _loaded(options)
+    completing = complete and with_texture and _can_complete(model, resolution, completion)
     for photo, folder in zip(photos, folders, strict=True):
         on_start(photo)
-        fitted = (folder / "report.json").is_file()
-        unfinished = options.get("complete", False) and not (folder / "albedo.png").is_file()
-        if fitted and not unfinished:
-            yield FolderEntry(photo, folder, None, None)
-            continue
+        fitted = None
         try:
-            if fitted:
-                name = str(read_fit(folder / "fit.npz").metadata["model"])
-                model = options.get("model", PAINTED_MODEL)
-                told, given = options.get("on_step", silent), options.get("completion") or {}
-                _complete(folder, name, model, given, told)
-                yield FolderEntry(photo, folder, None, None)
-                continue
-            yield FolderEntry(photo, folder, digitize(photo, folder, **options), None)
+            if not (folder / "report.json").is_file():
+                fitted = _digitize(photo, folder, completion, completing, **options)
+            elif completing and not (folder / "albedo.png").is_file():
+                complete_folder(folder, **{"model": model, **completion})
+            yield FolderEntry(photo, folder, fitted, None)
         except (ValueError, FileNotFoundError) as error:
             yield FolderEntry(photo, folder, None, str(error))

@@ -115,11 +115,11 @@ def build_database(
     paths = dict(zip(names, photos, strict=True))
     sources = {n: FittedPhoto(paths[n], saved, remove_specularity) for n, saved in fits.items()}
     lights = _lights(sources, face, Path(out) / LIGHT, common_light)
-    mirrored = jnp.asarray(mirror_uv(face, layout))
+    source_uv = jnp.asarray(mirror_uv(face, layout))
     for index, (subject, source) in enumerate(sources.items()):
         problem = lights[subject].problem
         if not database.is_whole(subject):
-            albedo, facts = _albedo(source, lights[subject].light, layout, mirrored, face)
+            albedo, facts = _albedo(source, lights[subject].light, layout, source_uv, face)
             database.write_subject(
                 subject, np.asarray(albedo), attributes={**lights[subject].facts, **facts}
             )
@@ -238,7 +238,7 @@ def _albedo(
     source: FittedPhoto,
     light: Float[Array, "9 3"],
     layout: UVLayout,
-    mirrored: Float[Array, "r r 2"],
+    source_uv: Float[Array, "r r 2"],
     model: MorphableModel,
 ) -> tuple[Float[Array, "r r 3"], dict[str, Any]]:
     """A whole albedo texture, linear RGB, and how much of it the photo shows."""
@@ -246,7 +246,7 @@ def _albedo(
     textured = texture(source.fitted(levels, light), layout.resolution)
     partial = textured.partial
     whole, borrowed = fill_from_mirror(
-        partial.albedo, partial.weight, textured.low_frequency, mirrored
+        partial.albedo, partial.weight, textured.low_frequency, source_uv
     )
     inside = layout.triangle >= 0
     covered = jnp.maximum(jnp.sum(inside), 1)

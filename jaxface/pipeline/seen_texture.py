@@ -137,34 +137,56 @@ def seen_texture(
     )
 
 
+def model_of(
+    folder: str | os.PathLike[str], model: str | os.PathLike[str] | MorphableModel | None = None
+) -> MorphableModel:
+    """The model that a folder's fit is of.
+
+    Args:
+        folder: that `save_fit` wrote.
+        model: the model or its file, where it is not a bundled one.
+
+    Raises:
+        FileNotFoundError: there is no fit, or no such file.
+        ValueError: the fit or the file is damaged, or the model is another one.
+    """
+    place = Path(folder)
+    saved = read_fit(_part(place, "fit.npz"))
+    name = str(saved.metadata.get("model"))
+    if model is None and name not in bundled_models():
+        raise ValueError(f"{place} was fitted with model {name!r}; name its file with --model")
+    face = model if isinstance(model, MorphableModel) else load_model(model or name)
+    y = saved.parameters
+    fitted = [y.identity.shape[0], y.expression.shape[0], y.albedo.shape[0]]
+    own = [face.identity.count, face.expression.count, face.albedo.count]
+    if face.name != name or fitted != own:
+        raise ValueError(
+            f"{place} was fitted with model {name!r} of {fitted} modes (identity, expression, "
+            f"albedo), not with {face.name!r} of {own}"
+        )
+    return face
+
+
 def read_seen_texture(
     folder: str | os.PathLike[str],
     resolution: int | None = None,
-    model: str | os.PathLike[str] | None = None,
+    model: str | os.PathLike[str] | MorphableModel | None = None,
 ) -> SeenTexture:
     """From a folder that `save_fit` wrote.
 
     Args:
         folder: with ``fit.npz`` and ``albedo_partial.exr``.
         resolution: texels along a side; as the partial albedo has by default.
-        model: file of the model, where it is not a bundled one.
+        model: the model or its file, where it is not a bundled one.
 
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: a file is damaged, or of another model.
     """
     place = Path(folder)
-    for name in ("fit.npz", "albedo_partial.exr"):
-        if not (place / name).is_file():
-            raise FileNotFoundError(f"{place} has no {name}; `jaxface digitize` writes it")
-    saved = read_fit(place / "fit.npz")
-    name = str(saved.metadata.get("model"))
-    if model is None and name not in bundled_models():
-        raise ValueError(f"{place} was fitted with model {name!r}; name its file with --model")
-    face = load_model(model or name)
-    if face.name != name or face.albedo.count != saved.parameters.albedo.shape[0]:
-        raise ValueError(f"{place} was fitted with model {name!r}, not with {face.name!r}")
-    partial = read_exr(place / "albedo_partial.exr")
+    saved = read_fit(_part(place, "fit.npz"))
+    face = model_of(place, model)
+    partial = read_exr(_part(place, "albedo_partial.exr"))
     if partial.shape[2] != 4:
         raise ValueError(f"{place / 'albedo_partial.exr'} needs RGB and weight, 4 channels")
     if "texels_per_pixel" not in saved.arrays:
@@ -180,6 +202,12 @@ def read_seen_texture(
     return seen_texture(
         finer, albedo, weight[..., 0], np.asarray(saved.parameters.albedo), scale * len(albedo)
     )
+
+
+def _part(place: Path, name: str) -> Path:
+    if not (place / name).is_file():
+        raise FileNotFoundError(f"{place} has no {name}; `jaxface digitize` writes it")
+    return place / name
 
 
 def _off_openings(
@@ -232,24 +260,35 @@ def _may_be_dark(
         if beard.sum() > 0 and cheek.sum() > 0:
             darker = np.average(ratio, weights=cheek) - np.average(ratio, weights=beard)
             smooth = smooth + np.clip((darker - 0.1) / 0.25, 0, 1) * 0.8 * np.asarray(r.beard)
-        # Brows differ in height and width: wider than the model's own.
-        brow = np.asarray(layout(r.brow[:, None], model.faces, 0.0))[..., 0]
-        step = layout.resolution / 128
-        wide = np.clip(3 * gaussian_filter(brow, step), 0, 1)
-        # At the outline of what is seen it is hair of the head that hangs in.
-        outline = np.asarray(distance_transform_edt(~_largest_part(weight < 0.05)))
-        hair = 3.0 * wide * np.clip((outline / step - 1.5) / 3, 0, 1)
-        # One brow is about as dark as the other: what is darker by far is that hair's, or shadow.
-        tone = ratio - np.average(ratio, weights=np.maximum(weight, 1e-6))
-        seen = mirrored(jnp.asarray(tone[..., None]), jnp.asarray(weight, jnp.float32), source)
-        sums, share = (gaussian_filter(np.asarray(seen)[..., k], step / 2) for k in (0, 1))
-        other = -minimum_filter(sums / np.maximum(share, 0.1), round(3 * step))
-        known = np.clip(2 * share - 0.5, 0, 1)
-        darkest = known * np.maximum(other, 0) + (1 - known) * hair
-        hair = np.minimum(hair, gaussian_filter(darkest, step) + OTHER_BROW)
+        hair = _brows(model, layout, ratio, weight, source)
     else:
         hair = 0.0
     return hair + np.asarray(layout(jnp.asarray(smooth[:, None]), model.faces, 0.0))[..., 0]
+
+
+def _brows(
+    model: MorphableModel,
+    layout: UVLayout,
+    ratio: Float[np.ndarray, "r r"],
+    weight: Float[np.ndarray, "r r"],
+    source: Float[Array, "r r 2"],
+) -> Float[np.ndarray, "r r"]:
+    """How much darker than skin brows may be, by the logarithm of albedo over the model's."""
+    # Brows differ in height and width: wider than the model's own.
+    brow = layout(skin_fields(model).regions.brow[:, None], model.faces, 0.0)
+    step = layout.resolution / 128
+    wide = np.clip(3 * gaussian_filter(np.asarray(brow)[..., 0], step), 0, 1)
+    # At the outline of what is seen it is hair of the head that hangs in.
+    outline = np.asarray(distance_transform_edt(~_largest_part(weight < 0.05)))
+    hair = 3.0 * wide * np.clip((outline / step - 1.5) / 3, 0, 1)
+    # One brow is about as dark as the other: what is darker by far is that hair's, or shadow.
+    tone = ratio - np.average(ratio, weights=np.maximum(weight, 1e-6))
+    seen = mirrored(jnp.asarray(tone[..., None]), jnp.asarray(weight, jnp.float32), source)
+    sums, share = (gaussian_filter(np.asarray(seen)[..., k], step / 2) for k in (0, 1))
+    other = -minimum_filter(sums / np.maximum(share, 0.1), round(3 * step))
+    known = np.clip(2 * share - 0.5, 0, 1)
+    darkest = known * np.maximum(other, 0) + (1 - known) * hair
+    return np.minimum(hair, gaussian_filter(darkest, step) + OTHER_BROW)
 
 
 def _largest_part(mask: Bool[np.ndarray, "r r"]) -> Bool[np.ndarray, "r r"]:

@@ -1,7 +1,6 @@
 """A picture of a mesh: projection, rasterisation, interpolation and shading in one call."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from jaxface._numerics import safe_normalize
@@ -92,8 +91,7 @@ def render_textured(
 
     The texture is read at the level of its mipmap on which a texel is as large as a pixel, by the
     areas of the seen triangle in both (Heckbert, "Texture mapping polygons in perspective", 1983,
-    with one footprint a triangle). Differentiable in the texture too; the level itself is held
-    fixed.
+    with one footprint a triangle). Differentiable in the texture too.
 
     Args:
         vertices: in the model's frame, mm.
@@ -120,7 +118,7 @@ def render_textured(
     size = jnp.array(texture.shapes[0][::-1], uv.dtype)
     texels = jnp.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1) * size
     ratio = _areas(texels, uv_faces) / jnp.maximum(_areas(screen[:, :2], faces), 1e-6)
-    level = jax.lax.stop_gradient(0.5 * jnp.log2(jnp.maximum(ratio, 1e-6)))
+    level = 0.5 * jnp.log2(jnp.maximum(ratio, 1e-6))
     points = interpolate(texels, uv_faces, fragments).reshape(-1, 2)
     seen = jnp.where(fragments.mask, level[jnp.maximum(fragments.triangle, 0)], 0.0)
     albedo = texture.trilinear(points, seen.reshape(-1)).reshape(height, width, -1)

@@ -1,7 +1,8 @@
 """A texture seen in the mirror: what one half of a face says of the other.
 
-The complexion of both halves is nearly the same. Where one is hidden, the other's is the best guess
-of its low frequencies.
+The complexion of both halves is nearly the same: where one is hidden, the other's is the best guess
+of its low frequencies (``with_other_side``). For a database's texture, which is to be whole, the
+detail is taken over too (``fill_from_mirror``).
 """
 
 import jax
@@ -37,8 +38,8 @@ def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     # Normals keep the two sides of thin parts (lids, lips) apart.
     tree = KDTree(np.concatenate([corners.mean(axis=1), 2 * extent * normal], axis=1))
-    mirrored = np.concatenate([corners.mean(axis=1) * flip, 2 * extent * normal * flip], axis=1)
-    partner = np.asarray(tree.query(mirrored)[1])
+    image = np.concatenate([corners.mean(axis=1) * flip, 2 * extent * normal * flip], axis=1)
+    partner = np.asarray(tree.query(image)[1])
 
     triangle = np.asarray(layout.triangle)
     uv = np.asarray(model.uv, np.float64)
@@ -70,6 +71,7 @@ def mirror_uv(model: MorphableModel, layout: UVLayout) -> Float[np.ndarray, "r r
     return result
 
 
+@jax.jit
 def mirrored(
     values: Float[Array, "r r c"], weight: Float[Array, "r r"], source_uv: Float[Array, "r r 2"]
 ) -> Float[Array, "r r d"]:
