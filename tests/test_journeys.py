@@ -61,9 +61,7 @@ def test_the_completion_is_of_the_model_that_was_fitted(told, other, database, t
     assert told[1][1]["database"] == database
 
 
-def test_a_model_without_a_database_is_fitted_alone(
-    told, other, tmp_path
-):
+def test_a_model_without_a_database_is_fitted_alone(told, other, tmp_path):
     with pytest.warns(UserWarning, match="no database in the UVs of 'other'"):
         digitize(
             PHOTO, tmp_path / "a", model=other, resolution=128, complete=True,
