@@ -217,6 +217,13 @@ def test_wrong_input_is_named(seen, database, network, model, tmp_path):
         complete(blind, database, network, SETTINGS)
     with pytest.raises(ValueError, match="no region 'beak'"):
         seen.detail_map({"beak": 1.0})
+    told = []
+    with pytest.raises(ValueError, match="no region 'beak'"):
+        complete(
+            seen, database, network, dataclasses.replace(SETTINGS, detail={"beak": 1.0}),
+            on_progress=lambda *step: told.append(step),
+        )  # fmt: skip
+    assert not told
     with pytest.raises(ValueError, match="square"):
         seen_texture(model, np.zeros((300, 200, 3)), np.zeros((300, 200)), np.zeros(11), 1.0)
     with pytest.raises(FileNotFoundError, match="jaxface digitize"):

@@ -144,6 +144,7 @@ class _Work:
     ) -> None:
         self.seen, self.database, self.network = seen, database, network
         self.settings, self.on_progress, self.blending = settings, on_progress, blending
+        self._detail = seen.detail_map(settings.detail)
         self.levels = [seen.resolution]
         while self.levels[0] >= 2 * COARSEST and self.levels[0] % 2 == 0:
             self.levels.insert(0, self.levels[0] // 2)
@@ -267,8 +268,7 @@ class _Work:
 
     def detail(self, level: int) -> Float[Array, "r r"]:
         """How much detail is let in at each texel, 0 to 1."""
-        asked = self.seen.detail_map(self.settings.detail)
-        return jnp.asarray(shrink(asked[..., None], level)[..., 0])
+        return jnp.asarray(shrink(self._detail[..., None], level)[..., 0])
 
     def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
         """The texture before synthesis: whole, sRGB-encoded."""
