@@ -34,7 +34,7 @@ from jaxface.models.features import STYLE_LAYERS, prepare_kernels
 from jaxface.models.random_features import SHAPES, random_network
 
 WHOLE = (256, 512, 1024)
-TILED = ((1024, 512), (2048, 1024), (4096, 1024))
+TILED = ((1024, 512), (2048, 1024), (4096, 1024), (8192, 1024))
 
 
 def measure(side: int, tile: int | None, calls: int, method: str) -> dict[str, Any]:
@@ -126,13 +126,15 @@ def main() -> None:
     parser.add_argument("--torch", metavar="PYTHON", help="an interpreter that has torch")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--largest", type=int, default=4096, help="largest side, px")
+    parser.add_argument("--smallest", type=int, default=0, help="smallest side, px")
     parser.add_argument("--one", nargs=4, metavar=("SIDE", "TILE", "CALLS", "METHOD"))
     options, remaining = parser.parse_known_args()
     if options.one:
         side, tile, calls = map(int, options.one[:3])
         print(json.dumps(measure(side, tile or None, calls, options.one[3])))
         return
-    bench = Benchmark("features")
+    bench = Benchmark(f"features_from_{options.smallest}" if options.smallest else "features")
+    sides = range(options.smallest, options.largest + 1)
     peer = [options.torch, str(Path(__file__).parent / "features_torch.py")]
 
     def ours(side: int, tile: int, calls: int, method: str = "auto") -> dict[str, Any]:
@@ -140,7 +142,7 @@ def main() -> None:
         return in_process([sys.executable, __file__, *arguments])
 
     speed = product_speed()
-    for side in (s for s in WHOLE if s <= options.largest):
+    for side in (s for s in WHOLE if s in sides):
         calls = 4 if side < 1024 else 2
         turns: dict[str, list[dict[str, Any]]] = {"jaxface": [], "jaxface, direct": [], "torch": []}
         for _ in range(options.turns):
@@ -157,7 +159,7 @@ def main() -> None:
                 mine, theirs = (whole[n].values["processor (s)"] for n in (name, "torch"))
                 values["of torch, processor"] = mine / theirs
             bench.record(_named(found, f"{side} px", name, values))
-    for side, tile in (pair for pair in TILED if pair[0] <= options.largest):
+    for side, tile in (pair for pair in TILED if pair[0] in sides):
         # The machine's speed drifts: what tiles cost is told against an image beside them.
         whole = [ours(1024, 0, 3)]
         found = best_of([ours(side, tile, 2 if side < 4096 else 1)])

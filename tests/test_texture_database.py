@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.uv import uv_layout
+from jaxface.io.cache import ENVIRONMENT
 from jaxface.io.image import write_png
 from jaxface.io.models import load_model
 from jaxface.io.skin_atlas import atlas_uv, read_skin, skin_name
-from jaxface.io.texture_database import INDEX, SCHEMA, TextureDatabase, uv_digest
+from jaxface.io.texture_database import (
+    INDEX,
+    SCHEMA,
+    TextureDatabase,
+    databases_dir,
+    uv_digest,
+)
 from jaxface.pipeline.skin_database import synth_database
 from jaxface.pipeline.texture_import import import_skins
 
@@ -133,6 +140,19 @@ def test_not_a_database(tmp_path, model):
         TextureDatabase(tmp_path)
     with pytest.raises(KeyError, match="no subject"):
         new(tmp_path / "x", model).encoded("nobody")
+
+
+def test_a_database_in_the_cache_goes_by_its_name(tmp_path, model, monkeypatch):
+    monkeypatch.setenv(ENVIRONMENT, str(tmp_path))
+    made = new(databases_dir() / "mine", model)
+    assert TextureDatabase("mine", model).path == made.path
+    monkeypatch.chdir(tmp_path)
+    nearer = new(tmp_path / "mine", model, 32)
+    assert TextureDatabase("mine").path.resolve() == nearer.path
+    with pytest.raises(FileNotFoundError, match=r"in the cache \(there: mine\)"):
+        TextureDatabase("yours")
+    with pytest.raises(FileNotFoundError):
+        TextureDatabase(tmp_path / "nowhere" / "mine")
 
 
 def test_uvs_of_another_model(tmp_path, model):

@@ -15,7 +15,10 @@ features_app = typer.Typer(no_args_is_help=True, help="Feature networks of the t
 
 DatabaseOption = Annotated[
     Path | None,
-    typer.Option("--database", help="Texture database; the procedural skins if not given."),
+    typer.Option(
+        "--database",
+        help="Texture database, a folder or a name of `database list`; else the procedural skins.",
+    ),
 ]
 FeaturesOption = Annotated[
     str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")

@@ -66,18 +66,15 @@ class TextureDatabase:
         """Open a database.
 
         Args:
-            path: the folder, or its ``database.json``.
+            path: the folder, its ``database.json``, or the name of one of `cached_databases`.
             model: where given, the model whose UVs the textures must be in.
 
         Raises:
-            FileNotFoundError: there is no such folder, or no ``database.json`` in it.
+            FileNotFoundError: there is no such folder or name, or no ``database.json`` in it.
             ValueError: the file is not of the format, or the UVs are of another model.
         """
-        folder = Path(path)
-        folder = folder.parent if folder.name == INDEX else folder
+        folder = _folder_of(path)
         index = folder / INDEX
-        if not index.is_file():
-            raise FileNotFoundError(f"{folder} is no texture database: it has no {INDEX}")
         try:
             content = json.loads(index.read_text(encoding="utf-8"))
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -306,3 +303,18 @@ def databases_dir() -> Path:
 def cached_databases() -> list[Path]:
     """Databases in `databases_dir`."""
     return sorted(path.parent for path in databases_dir().glob(f"*/{INDEX}"))
+
+
+def _folder_of(path: str | os.PathLike[str]) -> Path:
+    folder = Path(path)
+    folder = folder.parent if folder.name == INDEX else folder
+    if (folder / INDEX).is_file():
+        return folder
+    named = databases_dir() / folder
+    if len(folder.parts) == 1 and (named / INDEX).is_file():
+        return named
+    known = ", ".join(cached.name for cached in cached_databases()) or "none"
+    raise FileNotFoundError(
+        f"{folder} is no texture database: it has no {INDEX}, nor is it the name of one in the "
+        f"cache (there: {known})"
+    )
