@@ -9,24 +9,18 @@ from scipy.ndimage import gaussian_filter
 
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
-from jaxface.io.fit_file import write_fit
-from jaxface.io.gltf import write_glb
 from jaxface.io.models import load_model
-from jaxface.io.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.models.parameters import neutral_parameters
 from jaxface.models.random_features import random_network
 from jaxface.models.skin.regions import skin_fields
 from jaxface.pipeline.completing import CompletionSettings, complete
 from jaxface.pipeline.completion_files import (
     _Checkpoint,
-    check_inputs,
     open_database,
-    parse_settings,
 )
 from jaxface.pipeline.completion_levels import OUTLINE, faded, level_steps, shrink
 from jaxface.pipeline.completion_records import Level
-from jaxface.pipeline.seen_texture import model_of, read_seen_texture, seen_texture
+from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
 
 SIZE = 256
 LAYERS = ("conv1_1", "conv2_1", "conv3_1")
@@ -232,61 +226,6 @@ def test_wrong_input_is_named(seen, database, network, model, tmp_path):
         open_database(None, dataclasses.replace(model, name="other"), SIZE)
 
 
-def test_what_cannot_be_completed_is_told_beforehand(database, model, tmp_path):
-    check_inputs(model, SIZE, database.path)
-    check_inputs(dataclasses.replace(model, name="other"), SIZE, database.path)
-    with pytest.raises(ValueError, match="256 or more"):
-        check_inputs(model, SIZE - 1, database.path)
-    with pytest.raises(ValueError, match="1 subjects; 2 are needed"):
-        alone = TextureDatabase.create(tmp_path, model, SIZE, name="alone", licence="CC0-1.0")
-        alone.write_subject("s", np.full((SIZE, SIZE, 3), 0.5))
-        check_inputs(model, SIZE, tmp_path)
-    with pytest.raises(ValueError, match="UV"):
-        check_inputs(dataclasses.replace(model, uv=model.uv[::-1]), SIZE, database.path)
-
-
-def test_a_fit_of_another_model_is_named(model, tmp_path):
-    def fitted(face, name):
-        write_fit(tmp_path / "fit.npz", neutral_parameters(face), {}, {"model": name})
-
-    fitted(model, "makehuman")
-    assert model_of(tmp_path) is not None and model_of(tmp_path, model) is model
-    fitted(model, "other")
-    other = dataclasses.replace(model, name="other")
-    assert model_of(tmp_path, other) is other
-    with pytest.raises(ValueError, match="--model"):
-        model_of(tmp_path)
-    with pytest.raises(ValueError, match="'other'.*not with 'makehuman'"):
-        model_of(tmp_path, model)
-    fewer = dataclasses.replace(model.identity, basis=model.identity.basis[..., :5])
-    fewer = dataclasses.replace(fewer, std=model.identity.std[:5])
-    fitted(dataclasses.replace(other, identity=fewer), "other")
-    with pytest.raises(ValueError, match=r"of \[5, .*not with 'other'"):
-        model_of(tmp_path, other)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"norm": "max"}, "norm is"),
-        ({"iterations": 0}, "at least one"),
-        ({"alpha": -1.0}, "weights of 0 or more"),
-        ({"start": "noise"}, "start is"),
-        ({"detail": "lips"}, "region=value"),
-        ({"photo": -1.0}, "weights of 0 or more"),
-    ],
-)
-def test_settings_are_checked(given, message):
-    with pytest.raises(ValueError, match=message):
-        parse_settings(**given)
-
-
-def test_settings_from_a_command_line():
-    settings = parse_settings(detail="lips=0.5, nose=0", photo=3.0, iterations=7)
-    assert settings.detail == {"lips": 0.5, "nose": 0.0}
-    assert settings.weights.photo == 3.0 and settings.iterations == 7
-
-
 def test_steps_halve_and_sum():
     assert level_steps(700, 3) == [400, 200, 100]
     assert min(level_steps(1, 4)) == 1
@@ -321,31 +260,3 @@ def test_blotches_fade_slowly_at_the_outline_pores_soon_and_the_complexion_stays
     assert kept(pores, inside) > 0.98 and kept(pores, beside_outline) > 0.9
     complexion = np.cos(2 * np.pi * (x - 90) / 400)
     assert abs(kept(complexion, inside & (radius < 50))) < 0.1
-
-
-def test_another_texture_for_a_mesh_on_disk(tmp_path, model):
-    from PIL import Image
-
-    for name, colour in (("old", 10), ("new", 200)):
-        Image.fromarray(np.full((8, 8, 3), colour, np.uint8)).save(tmp_path / f"{name}.png")
-    old, new = ((tmp_path / f"{name}.png").read_bytes() for name in ("old", "new"))
-    vertices = np.eye(3)
-    faces = np.array([[0, 1, 2]])
-    write_glb(
-        tmp_path / "m.glb", vertices, faces, uv=np.eye(3)[:, :2], uv_faces=faces, texture=old,
-        morphs={"a": np.ones((3, 3))}, weights={"a": 0.2},
-    )  # fmt: skip
-    before = (tmp_path / "m.glb").read_bytes()
-    retexture_glb(tmp_path / "m.glb", new + b"\0" * 7)
-    after = (tmp_path / "m.glb").read_bytes()
-    assert old in before and old not in after and new in after
-    retexture_glb(tmp_path / "m.glb", old)
-    assert len((tmp_path / "m.glb").read_bytes()) == len(before)
-    (tmp_path / "m.mtl").write_text("newmtl skin\nmap_Kd texture.png\n")
-    retexture_obj(tmp_path / "m.obj", "albedo.png")
-    assert "map_Kd albedo.png" in (tmp_path / "m.mtl").read_text()
-    (tmp_path / "bad.glb").write_bytes(b"glTF")
-    with pytest.raises(ValueError, match="not a readable GLB"):
-        retexture_glb(tmp_path / "bad.glb", new)
-    with pytest.raises(FileNotFoundError):
-        retexture_glb(tmp_path / "none.glb", new)

@@ -14,7 +14,7 @@ from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.resample import resize
 from jaxface.io.exr import read_exr, srgb_encoded
-from jaxface.io.fit_file import read_fit
+from jaxface.io.fit_file import SavedFit, read_fit
 from jaxface.io.model_file import bundled_models
 from jaxface.io.models import load_model
 from jaxface.models.morphable import MorphableModel
@@ -151,7 +151,12 @@ def model_of(
         ValueError: the fit or the file is damaged, or the model is another one.
     """
     place = Path(folder)
-    saved = read_fit(_part(place, "fit.npz"))
+    return _model_of(place, read_fit(_part(place, "fit.npz")), model)
+
+
+def _model_of(
+    place: Path, saved: SavedFit, model: str | os.PathLike[str] | MorphableModel | None
+) -> MorphableModel:
     name = str(saved.metadata.get("model"))
     if model is None and name not in bundled_models():
         raise ValueError(f"{place} was fitted with model {name!r}; name its file with --model")
@@ -185,7 +190,7 @@ def read_seen_texture(
     """
     place = Path(folder)
     saved = read_fit(_part(place, "fit.npz"))
-    face = model_of(place, model)
+    face = _model_of(place, saved, model)
     partial = read_exr(_part(place, "albedo_partial.exr"))
     if partial.shape[2] != 4:
         raise ValueError(f"{place / 'albedo_partial.exr'} needs RGB and weight, 4 channels")
