@@ -23,9 +23,9 @@ import numpy as np
 import texture_grams
 from harness import Benchmark, Measurement, timed
 
-from jaxface.solvers.simplex import minimise_on_simplex
-from jaxface.stages.blend import blend, blend_reduced, blend_weights, reduce_database
-from jaxface.stages.blend.solve import Reduced
+from jaxface.solvers.simplex._minimise_on_simplex import minimise_on_simplex
+from jaxface.stages.blending import blend, blend_reduced, blend_weights, reduce_database
+from jaxface.stages.blending.solve import Reduced
 
 SUBJECTS, TARGETS = 592, 64
 

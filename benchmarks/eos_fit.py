@@ -23,7 +23,7 @@ from ground_truth import Subject, place
 from harness import Benchmark
 from landmark_fit import LandmarkFitter
 
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 
 SIZE = 512
 YAWS = (0.0, 15.0, 30.0)

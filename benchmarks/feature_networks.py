@@ -27,8 +27,8 @@ from skimage import data
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import TRAINED, load_network
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
-from jaxface.models.random_features import random_network
+from jaxface.networks.texture_features.network import STYLE_LAYERS, FeatureNetwork
+from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.training.features import batch_grams, relative_distances
 
 SIDE = 192

@@ -28,10 +28,10 @@ import jax
 import jax.numpy as jnp
 from harness import Benchmark, Measurement
 
-from jaxface.energies.gram import StyleTargets, style_value_and_grad
-from jaxface.io.memory import keep_freed_memory
-from jaxface.models.features import STYLE_LAYERS, prepare_kernels
-from jaxface.models.random_features import SHAPES, random_network
+from jaxface.energies._gram import StyleTargets, style_value_and_grad
+from jaxface.networks.texture_features.network import STYLE_LAYERS, prepare_kernels
+from jaxface.networks.texture_features.random_weights import SHAPES, random_network
+from jaxface.run.memory import keep_freed_memory
 
 WHOLE = (256, 512, 1024)
 TILED = ((1024, 512), (2048, 1024), (4096, 1024), (8192, 1024))

@@ -24,10 +24,10 @@ import time
 
 from harness import Benchmark, Measurement
 
-from jaxface.io.cache import ENVIRONMENT, enable_compilation_cache
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.pipeline import Clock, FittedFace, fit
-from jaxface.pipeline.journeys import demo_photo
+from jaxface.pipeline._digitize import demo_photo
+from jaxface.run.compile_cache import ENVIRONMENT, enable_compilation_cache
 
 DETAILS = {"default": (0, 1, 1), "fine": (0, 1, 2)}
 

@@ -23,14 +23,14 @@ from harness import RESULTS, provenance
 from photo_fit import fit_photo
 from PIL import Image
 
-from jaxface.io.cache import enable_compilation_cache
-from jaxface.io.drawing import draw_landmarks
-from jaxface.io.models import load_model
-from jaxface.io.overlay import contact_sheet
+from jaxface.io.face_models import load_model
+from jaxface.io.pictures.drawing import draw_landmarks
+from jaxface.io.pictures.overlay import contact_sheet
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.embedding import embed_landmarks
+from jaxface.pipeline.databases.embedding import embed_landmarks
 from jaxface.render.shading import irradiance
+from jaxface.run.compile_cache import enable_compilation_cache
 
 COLUMNS = (
     ("median", "median mm"),

@@ -14,7 +14,7 @@ import numpy as np
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.rotation import similarity_transform
 from jaxface.models.morphable import MorphableModel
-from jaxface.render.rasterize import rasterize
+from jaxface.render._rasterize import rasterize
 from jaxface.render.shading import irradiance
 
 RADIUS = 95.0  # mm

@@ -18,7 +18,7 @@ from head_props import fill_holes, painted_albedo
 from mitsuba_scene import Surface, load_mitsuba, render, render_unshadowed
 from PIL import Image
 
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
 

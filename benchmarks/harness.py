@@ -25,7 +25,7 @@ from typing import Any
 
 import jax
 
-from jaxface.io.environment import environment
+from jaxface.run.environment import environment
 
 RESULTS = Path(__file__).parent / "results"
 SCHEMA = 1

@@ -13,13 +13,13 @@ from jaxface._types import Array, Bool, Float
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.imaging.masks import smoothstep
-from jaxface.io.models import load_model
+from jaxface.imaging.resample import block_means
+from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
-from jaxface.pipeline.completion_levels import shrink
-from jaxface.pipeline.scan_import import import_scan
-from jaxface.pipeline.seen_texture import SeenTexture, seen_texture
+from jaxface.pipeline.databases.scan import import_scan
+from jaxface.pipeline.texture.seen import SeenTexture, seen_texture
 
 SCAN = "lee-perry-smith"
 SCAN_LICENCE = 'CC-BY 3.0, "Infinite, 3D Head Scan by Lee Perry-Smith" (ir-ltd.net)'
@@ -64,7 +64,8 @@ def read_skins(folder: str | os.PathLike[str], side: int, without: Sequence[str]
     """A database's textures at a lower resolution."""
     stored = TextureDatabase(folder)
     return Skins(stored.name, {
-        name: shrink(stored.encoded(name), side) for name in stored.names if name not in without
+        name: block_means(stored.encoded(name), side)
+        for name in stored.names if name not in without
     })  # fmt: skip
 
 
@@ -96,14 +97,14 @@ def read_truth(folder: str | os.PathLike[str] | None, side: int) -> np.ndarray:
         side: texels along a side.
     """
     if folder is not None:
-        return shrink(TextureDatabase(folder).encoded(SCAN), side)
+        return block_means(TextureDatabase(folder).encoded(SCAN), side)
     data = Path(os.environ.get("JAXFACE_DATA", Path(__file__).parents[2] / "shared" / "data"))
     scan = data / "lps_head"
     out = Path(os.environ.get("TMPDIR", "/tmp")) / "jaxface-held-out-skin"
     database, _ = import_scan(
         scan / "head.obj", scan / "head_diffuse.jpg", out, 1024, subject=SCAN, licence=SCAN_LICENCE
     )
-    return shrink(database.encoded(SCAN), side)
+    return block_means(database.encoded(SCAN), side)
 
 
 def coefficients(

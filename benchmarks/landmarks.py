@@ -15,7 +15,7 @@ import numpy as np
 import skimage.data
 from harness import Benchmark
 
-from jaxface.models.landmarks_net import Region, symmetric_landmarks
+from jaxface.networks.landmarks.face_mesh import Region, symmetric_landmarks
 from jaxface.stages.landmarks import bundled_networks, detect_faces, detect_one
 
 DETECTOR = "one 128 px picture through the detector"

@@ -25,13 +25,13 @@ import typer
 from harness import Benchmark, Measurement
 from threadpoolctl import threadpool_limits
 
-from jaxface.energies.gram import grams, mask_out
+from jaxface.energies._gram import grams, mask_out
 from jaxface.io.feature_weights import load_network
-from jaxface.io.memory import keep_freed_memory
 from jaxface.io.texture_database import Subject
-from jaxface.models.random_features import natural_noise
-from jaxface.pipeline.gram_database import intensity, masked_grams, precompute
-from jaxface.stages.masked_grams import compressed, layout, masked_grams_of, prepare, store
+from jaxface.networks.texture_features.random_weights import natural_noise
+from jaxface.pipeline.databases.grams import intensity, masked_grams, precompute
+from jaxface.run.memory import keep_freed_memory
+from jaxface.stages.texture.masked_grams import compressed, layout, masked_grams_of, prepare, store
 
 SIDE = 1024
 HOLES = (

@@ -21,9 +21,9 @@ from mitsuba_scene import Surface, load_mitsuba, render
 from PIL import Image
 
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.skin.regions import skin_fields
-from jaxface.pipeline.photo_database import build_database
+from jaxface.pipeline.databases.from_photos import build_database
 
 GLOSS = 0.35
 """roughness of the coat"""

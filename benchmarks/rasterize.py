@@ -21,11 +21,11 @@ from harness import Benchmark, Measurement, timed
 
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.geometry.mesh import vertex_normals
-from jaxface.io.model_file import load_bundled
+from jaxface.io.face_models.model_file import load_bundled
 from jaxface.models.subdivide import subdivide
+from jaxface.render._rasterize import Fragments, barycentrics, rasterize
 from jaxface.render.coverage import inverse_depth_at, pixel_block
 from jaxface.render.image import render
-from jaxface.render.rasterize import Fragments, barycentrics, rasterize
 from jaxface.render.shading import ambient_light
 
 

@@ -26,14 +26,14 @@ from held_out_skin import read_skins
 from scipy.ndimage import gaussian_filter
 
 from jaxface._types import Array, Float
-from jaxface.energies.gram import StyleTargets, grams, style_energy
+from jaxface.energies._gram import StyleTargets, grams, style_energy
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import load_network
-from jaxface.io.memory import keep_freed_memory
-from jaxface.models.features import FeatureNetwork, prepare_kernels
-from jaxface.pipeline.skin_database import synth_database
-from jaxface.solvers.minimise import METHODS, minimise
-from jaxface.stages.synthesise import changed
+from jaxface.networks.texture_features.network import FeatureNetwork, prepare_kernels
+from jaxface.pipeline.databases.painted import synth_database
+from jaxface.run.memory import keep_freed_memory
+from jaxface.solvers._minimise import METHODS, minimise
+from jaxface.stages.texture._synthesise import changed
 
 MARKS = (25, 50, 100, 200)
 """evaluations after which the energy is noted, as a share of that at the start"""

@@ -12,8 +12,8 @@ from skimage.color import deltaE_cie76, rgb2lab
 from jaxface._types import Array, Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import load_network
-from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, features
-from jaxface.models.random_features import random_network
+from jaxface.networks.texture_features.network import STYLE_LAYERS, FeatureNetwork, features
+from jaxface.networks.texture_features.random_weights import random_network
 
 MEASURING_SEED = 4021
 """of the measuring network: no synthesis has seen it"""

@@ -26,12 +26,12 @@ from texture_quality_table import write_results
 
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import load_network
-from jaxface.models.features import STYLE_LAYERS
-from jaxface.pipeline.completing import Completed, CompletionSettings, complete
-from jaxface.pipeline.skin_database import synth_database
-from jaxface.stages.blend import blend, nearest_subject, unconstrained
-from jaxface.stages.detail import COMPLEXION, with_complexion
-from jaxface.stages.synthesise import SynthesisWeights
+from jaxface.networks.texture_features.network import STYLE_LAYERS
+from jaxface.pipeline.databases.painted import synth_database
+from jaxface.pipeline.texture._complete import Completed, CompletionSettings, complete
+from jaxface.stages.blending import blend, nearest_subject, unconstrained
+from jaxface.stages.texture._synthesise import SynthesisWeights
+from jaxface.stages.texture.detail import COMPLEXION, with_complexion
 
 SIDE, ITERATIONS = 512, 60
 """of the rows in results/texture_quality.json"""

@@ -15,12 +15,12 @@ from harness import Benchmark, Measurement, timed
 
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.subdivide import subdivide
-from jaxface.render.rasterize import rasterize
+from jaxface.render._rasterize import rasterize
 from jaxface.render.shading import ambient_light
-from jaxface.stages.low_frequency import low_frequency_albedo
-from jaxface.stages.unwrap import unwrap
+from jaxface.stages._unwrap import unwrap
+from jaxface.stages.texture.low_frequency import low_frequency_albedo
 
 SIZE = 1024
 DISTANCE = 700.0

@@ -66,8 +66,8 @@ def small_parameters(model: MorphableModel, seed: int = 1, spread: float = 0.1) 
 
 def small_samples(model: MorphableModel, y: FaceParameters, size: int = 40, seed: int = 2):
     """Visible pixels of a random photo at ``y``, fewer than there is room for."""
-    from jaxface.energies.photometric import sample_pixels
-    from jaxface.render.rasterize import rasterize
+    from jaxface.render._rasterize import rasterize
+    from jaxface.stages.fit.samples import sample_pixels
 
     principal = jnp.array([0.48, 0.53])
     screen = y.camera(principal, size).project(y.pose(model.shape(y.identity, y.expression)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from jaxface.io.models import (
+from jaxface.io.face_models import (
     load_bfm2009,
     load_bfm_h5,
     load_model,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.stages.blend import (
+from jaxface.stages.blending import (
     blend,
     blend_reduced,
     blend_weights,
@@ -14,7 +14,7 @@ from jaxface.stages.blend import (
     reduce_database,
     unconstrained,
 )
-from jaxface.stages.blend.columns import blocks
+from jaxface.stages.blending.columns import blocks
 
 NORMS = ("frobenius", "squared")
 SIZES = {"conv1_1": 8, "conv2_1": 12}
@@ -96,8 +96,8 @@ def test_several_targets_memory_mapped_in_blocks(problem, tmp_path, monkeypatch)
     for name, value in database.items():
         np.save(tmp_path / f"{name}.npy", value)
         stored[name] = np.load(tmp_path / f"{name}.npy", mmap_mode="r")
-    monkeypatch.setattr("jaxface.stages.blend.columns.BLOCK_BYTES", 8 * 28 * 20)
-    monkeypatch.setattr("jaxface.stages.blend.mixing.BLOCK_BYTES", 8 * 144 * 2)
+    monkeypatch.setattr("jaxface.stages.blending.columns.BLOCK_BYTES", 8 * 28 * 20)
+    monkeypatch.setattr("jaxface.stages.blending.mixing.BLOCK_BYTES", 8 * 144 * 2)
     together = blend(stored, targets)
     assert together.weights.shape == (3, 25)
     for number in range(3):
@@ -119,7 +119,7 @@ def test_several_targets_memory_mapped_in_blocks(problem, tmp_path, monkeypatch)
 def test_blocks_have_the_matrices_length(problem, sample, monkeypatch):
     database, _ = problem
     stack = database["conv2_1"]
-    monkeypatch.setattr("jaxface.stages.blend.columns.BLOCK_BYTES", 8 * 25 * 12)
+    monkeypatch.setattr("jaxface.stages.blending.columns.BLOCK_BYTES", 8 * 25 * 12)
     read = list(blocks((stack[:10], stack[10:]), 2.0, sample))
     assert len(read) > 1 and all(block.dtype == np.float64 for block in read)
     squares = sum(np.sum(block**2, axis=1) for block in read)

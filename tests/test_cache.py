@@ -8,7 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxface.io.cache import cache_dir, enable_compilation_cache
+from jaxface.io.cache_folder import cache_dir
+from jaxface.run.compile_cache import enable_compilation_cache
 
 
 def current() -> str | None:
@@ -62,7 +63,7 @@ def test_oldest_entries_are_pruned(tmp_path: Path) -> None:
 def test_a_second_process_finds_the_first_ones_program(tmp_path: Path) -> None:
     code = (
         "import jax, sys\n"
-        "from jaxface.io.cache import enable_compilation_cache\n"
+        "from jaxface.run.compile_cache import enable_compilation_cache\n"
         "enable_compilation_cache(sys.argv[1], minimum_seconds=0.0)\n"
         "jax.monitoring.register_event_listener(\n"
         "    lambda name, **kw: print(name) if name.endswith('cache_hits') else None)\n"

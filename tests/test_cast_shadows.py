@@ -7,24 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.energies.photometric import sample_pixels
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.normal_stencil import normal_stencil
 from jaxface.models.linear import LinearBasis
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
-from jaxface.render.interpolate import interpolate
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import rasterize
 from jaxface.render.occlusion import (
     hidden_directions,
     hidden_shading,
     self_occlusion,
     sphere_lattice,
 )
-from jaxface.render.rasterize import rasterize
 from jaxface.render.shading import irradiance
-from jaxface.stages.fit.cast_shadows import cast_shadows, shadow_trust
+from jaxface.stages.fit._cast_shadows import cast_shadows, shadow_trust
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitInput
+from jaxface.stages.fit.samples import sample_pixels
 from tests.small_scene import grid_faces
 
 SIZE = 96

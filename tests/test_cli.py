@@ -139,7 +139,7 @@ def test_a_folder_that_makes_no_database(tmp_path):
 
 
 def test_precompute_says_its_size_and_goes_on(tmp_path):
-    from jaxface.io.models import load_model
+    from jaxface.io.face_models import load_model
     from jaxface.io.texture_database import TextureDatabase
 
     database = TextureDatabase.create(

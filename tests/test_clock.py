@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.pipeline.clock import Clock, KeptProgram
+from jaxface.run.clock import Clock, KeptProgram
 
 
 @pytest.fixture
@@ -76,8 +76,8 @@ def test_a_kept_program_does_not_depend_on_where_its_arguments_lie(monkeypatch):
         def compile(self):
             return lambda *leaves: leaves
 
-    monkeypatch.setattr("jaxface.pipeline.clock.kept_program", lambda name, function, *args: None)
-    monkeypatch.setattr("jaxface.pipeline.clock.jax.jit", lambda function, **how: Jitted())
+    monkeypatch.setattr("jaxface.run.clock.kept_program", lambda name, function, *args: None)
+    monkeypatch.setattr("jaxface.run.clock.jax.jit", lambda function, **how: Jitted())
     program = KeptProgram("anything", lambda x, y: x)
     assert Clock().run("anything", program, jnp.ones(3), 2.0)[1] == 2.0
     assert seen == [(jax.ShapeDtypeStruct((3,), jnp.float32), 2.0)]

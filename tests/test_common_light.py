@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxface.render.shading import sh_basis
-from jaxface.stages.common_light import LitVertices, common_light
+from jaxface.stages._common_light import LitVertices, common_light
 
 
 def scene(photos=4, vertices=400, outliers=0.0):

@@ -9,18 +9,19 @@ from scipy.ndimage import gaussian_filter
 
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
-from jaxface.io.models import load_model
+from jaxface.imaging.resample import block_means
+from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.models.random_features import random_network
 from jaxface.models.skin.regions import skin_fields
-from jaxface.pipeline.completing import CompletionSettings, complete
-from jaxface.pipeline.completion_files import (
+from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.pipeline.texture._complete import CompletionSettings, complete
+from jaxface.pipeline.texture.completion_levels import OUTLINE, faded, level_steps
+from jaxface.pipeline.texture.folder import (
     _Checkpoint,
     open_database,
 )
-from jaxface.pipeline.completion_levels import OUTLINE, faded, level_steps, shrink
-from jaxface.pipeline.completion_records import Level
-from jaxface.pipeline.seen_texture import read_seen_texture, seen_texture
+from jaxface.pipeline.texture.records import Level
+from jaxface.pipeline.texture.seen import read_seen_texture, seen_texture
 
 SIZE = 256
 LAYERS = ("conv1_1", "conv2_1", "conv3_1")
@@ -233,8 +234,8 @@ def test_steps_halve_and_sum():
 
 def test_shrink_averages_blocks():
     texture = np.arange(16.0).reshape(4, 4, 1)
-    np.testing.assert_allclose(shrink(texture, 2)[..., 0], [[2.5, 4.5], [10.5, 12.5]])
-    assert shrink(texture, 8).shape == (4, 4, 1)
+    np.testing.assert_allclose(block_means(texture, 2)[..., 0], [[2.5, 4.5], [10.5, 12.5]])
+    assert block_means(texture, 8).shape == (4, 4, 1)
 
 
 def test_blotches_fade_slowly_at_the_outline_pores_soon_and_the_complexion_stays():

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from jaxface.io.face_models import load_model
 from jaxface.io.fit_file import write_fit
-from jaxface.io.gltf import write_glb
-from jaxface.io.models import load_model
-from jaxface.io.retexture import retexture_glb, retexture_obj
+from jaxface.io.formats.gltf import write_glb
+from jaxface.io.formats.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.parameters import neutral_parameters
-from jaxface.pipeline.completion_files import check_inputs, parse_settings
-from jaxface.pipeline.seen_texture import model_of
+from jaxface.pipeline.texture.folder import check_inputs, parse_settings
+from jaxface.pipeline.texture.seen import model_of
 
 SIZE = 256
 

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.models.constant_response import constant_maps
-from jaxface.models.features import blocks_up_to, features
-from jaxface.models.random_features import random_network
+from jaxface.networks.texture_features.constant_response import constant_maps
+from jaxface.networks.texture_features.network import blocks_up_to, features
+from jaxface.networks.texture_features.random_weights import random_network
 
 LAYERS = ("conv1_1", "conv1_2", "conv2_1", "conv3_1", "conv3_2", "conv3_3", "conv4_1")
 SHAPE = ((2, 4), (1, 6), (3, 5), (1, 6))

@@ -11,9 +11,10 @@ import pytest
 from jaxface.geometry.normal_stencil import normal_stencil
 from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import linear_to_srgb, rgb_to_yiq
-from jaxface.models.random_features import random_network
+from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.pipeline.differentiable import TextureProblem, TextureWeights, infer_texture
 from jaxface.render.image import render
+from jaxface.stages._unwrap import unwrap
 from jaxface.stages.fit import (
     FitConfig,
     FitInput,
@@ -22,7 +23,6 @@ from jaxface.stages.fit import (
     fit_hidden_shading,
     fit_parameters,
 )
-from jaxface.stages.unwrap import unwrap
 from tests.small_scene import small_model, small_parameters
 
 SIZE, RESOLUTION = 32, 24

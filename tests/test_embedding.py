@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxface.io.model_file import load_bundled
-from jaxface.pipeline.embedding import _closest_weights, embed_landmarks, with_landmarks
+from jaxface.io.face_models.model_file import load_bundled
+from jaxface.pipeline.databases.embedding import _closest_weights, embed_landmarks, with_landmarks
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.parameters import neutral_parameters
-from jaxface.pipeline.face_views import SIDE, VIEWS, face_views, studio_light
+from jaxface.pipeline.texture.views import SIDE, VIEWS, face_views, studio_light
 from jaxface.render.occlusion import sphere_lattice
 from jaxface.render.shading import irradiance
 

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.energies.gram import grams
+from jaxface.energies._gram import grams
 from jaxface.io.feature_weights import load_network
-from jaxface.io.image import write_png
-from jaxface.models.features import STYLE_LAYERS, FeatureNetwork
-from jaxface.models.random_features import natural_noise, random_network
-from jaxface.pipeline import feature_training
-from jaxface.pipeline.feature_training import folder_pictures, train_features
+from jaxface.io.formats.image import write_png
+from jaxface.networks.texture_features.network import STYLE_LAYERS, FeatureNetwork
+from jaxface.networks.texture_features.random_weights import natural_noise, random_network
+from jaxface.pipeline.training import features as feature_training
+from jaxface.pipeline.training.features import folder_pictures, train_features
 from jaxface.training.features import (
     CROP,
     TRAINING_ROWS,

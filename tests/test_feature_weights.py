@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.energies.gram import grams
+from jaxface.energies._gram import grams
 from jaxface.io import feature_weights
 from jaxface.io.feature_weights import load_network, read_network, save_network
-from jaxface.io.restricted_pickle import UnsafePickleError
-from jaxface.io.safetensors_file import load_safetensors
-from jaxface.io.torch_file import load_torch_tensors
-from jaxface.models.features import features
-from jaxface.models.random_features import random_network
+from jaxface.io.formats.restricted_pickle import UnsafePickleError
+from jaxface.io.formats.safetensors_file import load_safetensors
+from jaxface.io.formats.torch_file import load_torch_tensors
+from jaxface.networks.texture_features.network import features
+from jaxface.networks.texture_features.random_weights import random_network
 
 DATA = Path(__file__).parent / "data" / "features"
 TINY = ((1, 4), (1, 4))

@@ -10,14 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxface.models.conv3x3 import (
+from jaxface.networks.convolution.conv3x3 import (
     METHODS,
     conv3x3,
     conv3x3_relu,
     direct_conv3x3,
     prepared_kernel,
 )
-from jaxface.models.features import (
+from jaxface.networks.convolution.shifted_sum import (
+    shifted_sum_conv3x3,
+    shifted_sum_conv3x3_transpose,
+)
+from jaxface.networks.convolution.winograd import winograd_conv3x3
+from jaxface.networks.texture_features.network import (
     STYLE_LAYERS,
     FeatureNetwork,
     features,
@@ -26,9 +31,7 @@ from jaxface.models.features import (
     prepare_kernels,
     with_indicator,
 )
-from jaxface.models.random_features import SHAPES, random_network
-from jaxface.models.shifted_sum import shifted_sum_conv3x3, shifted_sum_conv3x3_transpose
-from jaxface.models.winograd import winograd_conv3x3
+from jaxface.networks.texture_features.random_weights import SHAPES, random_network
 
 SMALL = ((1, 6), (2, 8), (1, 8))
 WIDE = ((1, 16), (2, 16))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.rotation import similarity_transform
-from jaxface.io.model_file import load_bundled
+from jaxface.io.face_models.model_file import load_bundled
 from jaxface.models.parameters import FaceParameters
 from jaxface.pipeline import fit
-from jaxface.pipeline.detail_levels import prepared_levels
+from jaxface.pipeline.fitting._detail_levels import prepared_levels
 from jaxface.stages.fit import (
     FitConfig,
     FitWeights,

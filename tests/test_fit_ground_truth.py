@@ -23,11 +23,11 @@ from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.colour import srgb_to_linear
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.subdivide import subdivide
-from jaxface.render.interpolate import interpolate
-from jaxface.render.rasterize import rasterize
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import rasterize
 from jaxface.render.shading import irradiance, sh_basis
 from jaxface.stages.landmarks import detect_one
 

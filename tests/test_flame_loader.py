@@ -8,8 +8,8 @@ import make_flame_fixture
 import numpy as np
 import pytest
 
-from jaxface.io.models import load_flame, load_model
-from jaxface.io.models.flame import joint_derivative
+from jaxface.io.face_models import load_flame, load_model
+from jaxface.io.face_models.flame import joint_derivative
 
 FIXTURES = Path(__file__).resolve().parent / "data"
 

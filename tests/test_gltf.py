@@ -14,7 +14,7 @@ from PIL import Image
 
 from jaxface.geometry.camera import Pose
 from jaxface.geometry.rotation import rotation_matrix
-from jaxface.io.gltf import GlbCamera, vertex_normals, write_glb
+from jaxface.io.formats.gltf import GlbCamera, vertex_normals, write_glb
 
 # A tetrahedron (mm) whose base is unwrapped on its own: vertices 0-2 have two uvs each.
 VERTICES = np.array([[0.0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100]])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxface.energies.gram import (
+from jaxface.energies._gram import (
     StyleTargets,
     feature_loss,
     gram,
@@ -18,9 +18,9 @@ from jaxface.energies.gram import (
     style_energy,
     style_value_and_grad,
 )
-from jaxface.models.feature_tiles import LARGEST_TILE, even_tile, tiling
-from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, features
-from jaxface.models.random_features import random_network
+from jaxface.networks.texture_features.network import STYLE_LAYERS, FeatureNetwork, features
+from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.networks.texture_features.tiles import LARGEST_TILE, even_tile, tiling
 
 SHAPE = ((2, 6), (1, 8), (2, 8))
 WIDE = ((1, 16), (2, 16))

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.io.models import (
+from jaxface.io.face_models import (
     load_ict,
     load_model,
 )
-from jaxface.io.models.assemble import BLENDSHAPE_STD
-from jaxface.io.obj import write_obj
+from jaxface.io.face_models.assemble import BLENDSHAPE_STD
+from jaxface.io.formats.obj import write_obj
 from tests.synthetic_head import COUNT, VERTICES, outward_volume
 
 

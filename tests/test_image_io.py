@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import ExifTags, Image, ImageCms
 
-from jaxface.io.exr import read_exr, srgb_encoded, write_exr
-from jaxface.io.image import Photo, read_image, write_png
-from jaxface.io.landmark_file import Landmarks, read_landmarks, write_landmarks
+from jaxface.io.formats.exr import read_exr, srgb_encoded, write_exr
+from jaxface.io.formats.image import Photo, read_image, write_png
+from jaxface.io.formats.landmark_file import Landmarks, read_landmarks, write_landmarks
 
 RNG = np.random.default_rng(0)
 BYTES = RNG.integers(0, 256, (20, 24, 3), np.uint8)

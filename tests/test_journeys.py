@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.pipeline import journeys
-from jaxface.pipeline.journeys import digitize, digitize_folder
+from jaxface.pipeline import _digitize as journeys
+from jaxface.pipeline._digitize import digitize, digitize_folder
 
 PHOTO = np.full((64, 64, 3), 0.5, np.float32)
 

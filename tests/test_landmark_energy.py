@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from jaxface.energies.landmark import LandmarkData, landmark_residual, slide_contour
+from jaxface.energies.landmark import LandmarkData, landmark_residual
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import SurfacePoints
+from jaxface.stages.fit.contour import slide_contour
 from tests.small_scene import small_model, small_parameters
 
 

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from jaxface.models import landmark_schemes as schemes
-from jaxface.models.blaze import depthwise_convolution, read_chain, same_padding
-from jaxface.models.face_detector import (
+from jaxface.networks.landmarks.blaze import depthwise_convolution, read_chain, same_padding
+from jaxface.networks.landmarks.face_detector import (
     Candidates,
     FaceDetector,
     anchor_centres,
     overlap,
     suppress,
 )
-from jaxface.models.landmarks_net import (
+from jaxface.networks.landmarks.face_mesh import (
     LandmarkNet,
     Region,
     landmarks_in_region,

@@ -10,7 +10,9 @@ PACKAGE = ROOT / "jaxface"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 BASE = {"_types", "_numerics", "_machine"}
-NUMERICAL = BASE | {"geometry", "imaging", "models", "render", "energies", "solvers"}
+NUMERICAL = BASE | {
+    "geometry", "imaging", "networks", "models", "render", "energies", "solvers",
+}  # fmt: skip
 
 # layer -> the layers it may import. Every layer may import itself, except stages (see below).
 ALLOWED = {
@@ -20,18 +22,20 @@ ALLOWED = {
     "_compilation": {"_types"},
     "geometry": BASE,
     "imaging": BASE,
+    "networks": BASE | {"geometry", "imaging"},
     "models": BASE | {"geometry", "imaging"},
     "render": BASE | {"geometry", "imaging"},
-    "energies": BASE | {"geometry", "imaging", "models", "render"},
+    "energies": BASE | {"geometry", "imaging", "networks", "models", "render"},
     "solvers": BASE,
     "stages": NUMERICAL | {"_compilation"},
     "training": NUMERICAL,
-    "io": BASE | {"geometry", "imaging", "models", "assets"},
+    "io": BASE | {"geometry", "imaging", "networks", "models", "assets"},
+    "run": BASE | {"io", ""},
     "assets": set(),
-    "pipeline": NUMERICAL | {"_compilation", "stages", "training", "io", "assets", ""},
-    "cli": {"pipeline", "io", ""},
+    "pipeline": NUMERICAL | {"_compilation", "stages", "training", "io", "run", "assets", ""},
+    "cli": {"pipeline", "io", "run", ""},
     "__main__": {"cli"},
-    "": NUMERICAL | {"stages", "training", "io", "pipeline"},
+    "": NUMERICAL | {"stages", "training", "io", "run", "pipeline"},
 }
 
 # third-party package -> the layers that may import it (any layer, for those not listed)

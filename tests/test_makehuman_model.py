@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.mesh import boundary_edges
-from jaxface.io.model_file import load_bundled, read_metadata
+from jaxface.io.face_models.model_file import load_bundled, read_metadata
 from jaxface.models.landmark_schemes import CONTOURS, landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide

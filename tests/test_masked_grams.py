@@ -7,17 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.energies.gram import grams, mask_out
+from jaxface.energies._gram import grams, mask_out
 from jaxface.io.texture_database import Subject, TextureDatabase
-from jaxface.models.random_features import random_network
-from jaxface.pipeline.gram_database import (
+from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.pipeline.databases.grams import (
     bytes_to_precompute,
     find_precomputed,
     intensity,
     masked_grams,
     precompute,
 )
-from jaxface.stages.masked_grams import compressed, layout, masked_grams_of, prepare, store
+from jaxface.stages.texture.masked_grams import compressed, layout, masked_grams_of, prepare, store
 
 LAYERS = ("conv1_1", "conv2_1", "conv2_2", "conv3_1")
 TOLERANCE = 3e-5  # of 16-bit steps; 2e-5 is reached where one cell's sum is all there is

@@ -10,16 +10,15 @@ from scipy.ndimage import distance_transform_edt
 from skimage.draw import polygon2mask
 
 from jaxface.imaging.masks import (
-    FACE_OVAL_468,
     dilate,
     distance_to,
     erode,
-    face_oval,
-    face_oval_mask,
     feather,
     fill_polygon,
     smoothstep,
 )
+from jaxface.models.face_oval import face_oval, face_oval_mask
+from jaxface.models.landmark_schemes import FACE_OVAL
 
 
 def random_mask(seed: int, shape=(37, 52), density=0.02) -> np.ndarray:
@@ -97,7 +96,7 @@ def test_face_oval_of_the_mesh_is_its_rim(data_dir):
         for edge in ((a, b), (b, c), (c, a)):
             count[frozenset(edge)] = count.get(frozenset(edge), 0) + 1
     border = {edge for edge, n in count.items() if n == 1}
-    ring = zip(FACE_OVAL_468, (*FACE_OVAL_468[1:], FACE_OVAL_468[0]), strict=True)
+    ring = zip(FACE_OVAL, (*FACE_OVAL[1:], FACE_OVAL[0]), strict=True)
     assert {frozenset(edge) for edge in ring} <= border
 
 

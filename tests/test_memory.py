@@ -9,7 +9,7 @@ import pytest
 FAULTS = """
 import resource, sys
 import jax, jax.numpy as jnp
-from jaxface.io.memory import keep_freed_memory
+from jaxface.run.memory import keep_freed_memory
 
 if sys.argv[1] == "keep":
     assert keep_freed_memory()
@@ -25,7 +25,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 RESIDENT = """
 import os
 import numpy as np
-from jaxface.io.memory import hand_back_freed_memory, keep_freed_memory
+from jaxface.run.memory import hand_back_freed_memory, keep_freed_memory
 
 def resident():
     with open("/proc/self/statm") as file:

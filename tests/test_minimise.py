@@ -8,8 +8,8 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxface.solvers._minimise import METHODS, minimise
 from jaxface.solvers.lbfgs import LBFGSState
-from jaxface.solvers.minimise import METHODS, minimise
 
 
 def rosenbrock(y, args):

@@ -2,8 +2,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.models import load_model
-from jaxface.stages.mirror_texture import GUESS, ROWS, fill_from_mirror, mirror_uv, with_other_side
+from jaxface.io.face_models import load_model
+from jaxface.stages.texture.mirror import GUESS, ROWS, fill_from_mirror, mirror_uv, with_other_side
 
 SIDE = 300  # not a multiple of the rows that are computed at once
 

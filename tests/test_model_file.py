@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.io.model_file import (
+from jaxface.io.face_models.model_file import (
     bundled_models,
     load_bundled,
     load_model,

@@ -9,14 +9,14 @@ import make_flame_fixture
 import numpy as np
 import pytest
 
-from jaxface.io.model_file import save_model
-from jaxface.io.models import (
+from jaxface.io.face_models import (
     describe,
     load_model,
     read_landmarks68,
 )
-from jaxface.io.models.cylinder import cylindrical_uv
-from jaxface.io.models.skin import generic_skin
+from jaxface.io.face_models.cylinder import cylindrical_uv
+from jaxface.io.face_models.model_file import save_model
+from jaxface.io.face_models.skin import generic_skin
 from tests.synthetic_head import COUNT, FACES, VERTICES
 
 FIXTURES = Path(__file__).resolve().parent / "data"

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxface.io.obj import read_obj, read_obj_vertices, triangles, write_obj
+from jaxface.io.formats.obj import read_obj, read_obj_vertices, triangles, write_obj
 
 SQUARE = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [5, 20, 1]])
 POLYGONS = np.array([[0, 1, 2, 3], [3, 2, 4, -1]])

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.stages.octaves import octave_bands, with_photos_octaves
+from jaxface.stages.texture.octaves import octave_bands, with_photos_octaves
 
 SIDE = 128
 

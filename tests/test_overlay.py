@@ -3,9 +3,16 @@
 import numpy as np
 import pytest
 
-from jaxface.io.colourmap import diverging, sequential
-from jaxface.io.drawing import as_rgb8, draw_landmarks, draw_points, draw_polyline, draw_text, tint
-from jaxface.io.overlay import contact_sheet, heatmap
+from jaxface.io.pictures.colourmap import diverging, sequential
+from jaxface.io.pictures.drawing import (
+    as_rgb8,
+    draw_landmarks,
+    draw_points,
+    draw_polyline,
+    draw_text,
+    tint,
+)
+from jaxface.io.pictures.overlay import contact_sheet, heatmap
 
 BLACK = np.zeros((40, 60, 3), np.uint8)
 RED = (255, 0, 0)

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from skimage import data
 
-from jaxface.pipeline.photo_database import build_database, subject_name
+from jaxface.pipeline.databases.from_photos import build_database, subject_name
 
 
 def test_bad_folders_are_told(tmp_path):

@@ -10,6 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
+from jaxface.energies._photometric_quadratic import (
+    normal_modes,
+    photometric_jacobian,
+    photometric_quadratic,
+)
 from jaxface.energies.photometric import (
     PhotometricData,
     photometric_difference,
@@ -17,14 +22,9 @@ from jaxface.energies.photometric import (
     photometric_residual,
     reweighting,
     synthesize,
-    thin_samples,
-)
-from jaxface.energies.photometric_quadratic import (
-    normal_modes,
-    photometric_jacobian,
-    photometric_quadratic,
 )
 from jaxface.geometry.normal_stencil import normal_stencil
+from jaxface.stages.fit.samples import thin_samples
 from tests.small_scene import small_model, small_parameters, small_samples
 
 # Compiled once for all the tests: their arguments have the same shapes.

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.opening_rims import opening_rims
-from jaxface.stages.detail import without_marks
-from jaxface.stages.plausible_skin import TONE, plausible_skin
+from jaxface.stages.texture._plausible_skin import TONE, plausible_skin
+from jaxface.stages.texture.detail import without_marks
 
 SIDE = 256
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE] + 0.5

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from jaxface.geometry.uv import seam_edges, uv_layout
 from jaxface.imaging.colour import luminance
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 from jaxface.models.skin import SkinAttributes, random_attributes, synthesise_skin
 from jaxface.models.skin.noise import gradient_noise, mix, visible
 from jaxface.models.skin.pigments import Density, absorb

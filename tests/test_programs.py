@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxface._types import Array, Float
-from jaxface.pipeline.programs import keep_structure, kept_program
+from jaxface.run.kept_programs import keep_structure, kept_program
 
 
 class Pair(eqx.Module):

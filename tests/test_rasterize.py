@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from jaxface.geometry.camera import Camera
 from jaxface.render import zbuffer
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import barycentrics, rasterize
 from jaxface.render.coverage import TILE_PIXELS, pixel_block, tile_bits, tile_shape
-from jaxface.render.interpolate import interpolate
-from jaxface.render.rasterize import barycentrics, rasterize
 
 HEIGHT, WIDTH = 45, 61
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.solvers.reduction import _turned, reduced, triangular_factor
+from jaxface.solvers.simplex.reduction import _turned, reduced, triangular_factor
 
 
 def block_reader(matrix, rows):

@@ -12,9 +12,9 @@ from scipy import sparse
 from jaxface.geometry.closest_point import TriangleTree, closest_weights
 from jaxface.geometry.registration import non_rigid_icp, similarity
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.models import load_model
-from jaxface.io.obj import write_obj
-from jaxface.pipeline.scan_import import register_scan, transfer
+from jaxface.io.face_models import load_model
+from jaxface.io.formats.obj import write_obj
+from jaxface.pipeline.databases.scan import register_scan, transfer
 
 
 def sphere(level: int = 3) -> tuple[np.ndarray, np.ndarray]:

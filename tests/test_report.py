@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from jaxface.io.atomic import atomic_path
-from jaxface.io.chart import HEIGHT, WIDTH, convergence_svg
-from jaxface.io.environment import environment
-from jaxface.io.report import format_number, plain, write_report
+from jaxface.io.pictures.chart import HEIGHT, WIDTH, convergence_svg
+from jaxface.io.pictures.report import format_number, plain, write_report
+from jaxface.run.environment import environment
 
 LEVELS = [
     {"name": "coarse", "terms": {"photo <&>": [1.0, 0.3, 0.1], "prior": [0.0, 1e-4, 2e-4]}},
@@ -64,6 +64,7 @@ def folder(tmp_path: Path) -> Path:
         "files": [{"file": "overlay.png", "what": "contact sheet"}],
         "warnings": ["two faces"],
         "covariance": np.array([[1.0, np.inf]]),
+        "environment": environment(),
     }
     write_report(tmp_path, data)
     return tmp_path

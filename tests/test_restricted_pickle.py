@@ -10,7 +10,7 @@ import scipy.sparse
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxface.io.restricted_pickle import UnsafePickleError, load_npy, load_npz, load_pickle
+from jaxface.io.formats.restricted_pickle import UnsafePickleError, load_npy, load_npz, load_pickle
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))

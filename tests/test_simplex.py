@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxface.solvers.jaxopt_import import NOTICE, jaxopt
-from jaxface.solvers.simplex import minimise_on_simplex, solve
+from jaxface.solvers.simplex._minimise_on_simplex import minimise_on_simplex, solve
 
 REFERENCES = Path(__file__).parent / "data" / "simplex_references.npz"
 NORMS = ("frobenius", "squared")

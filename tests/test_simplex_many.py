@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.solvers.simplex import minimise_on_simplex, solve
-from jaxface.solvers.simplex_faces import SLOTS, Products, newton_on_faces
-from jaxface.stages.blend import blend_reduced
-from jaxface.stages.blend.solve import Reduced
+from jaxface.solvers.simplex._minimise_on_simplex import minimise_on_simplex, solve
+from jaxface.solvers.simplex.faces import SLOTS, Products, newton_on_faces
+from jaxface.stages.blending import blend_reduced
+from jaxface.stages.blending.solve import Reduced
 
 NORMS = ("frobenius", "squared")
 OUTSIDE = 7

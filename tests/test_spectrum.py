@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxface.imaging.spectrum import inverse_frequency
-from jaxface.stages.synthesise import changed
+from jaxface.stages.texture._synthesise import changed
 
 
 @settings(deadline=None, max_examples=20)

@@ -7,8 +7,8 @@ import make_surrey_fixture
 import numpy as np
 import pytest
 
-from jaxface.io.models import load_model, load_surrey
-from jaxface.io.models.assemble import BLENDSHAPE_STD
+from jaxface.io.face_models import load_model, load_surrey
+from jaxface.io.face_models.assemble import BLENDSHAPE_STD
 from tests.synthetic_head import decode
 
 FIXTURES = Path(__file__).resolve().parent / "data"

@@ -8,16 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxface.energies.gram import StyleTargets, grams
-from jaxface.energies.kept_detail import KnownDetail, known_detail_energy, low_pass
-from jaxface.models.random_features import random_network
-from jaxface.stages.detail import soft_inside, with_complexion, with_intensity, with_photo
-from jaxface.stages.synthesise import (
+from jaxface.energies._gram import StyleTargets, grams
+from jaxface.energies.known_detail import KnownDetail, known_detail_energy
+from jaxface.imaging.low_pass import low_pass
+from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.stages.texture._synthesise import (
     SynthesisProblem,
     SynthesisWeights,
     synthesis_energy,
     synthesise,
 )
+from jaxface.stages.texture.detail import soft_inside, with_complexion, with_intensity, with_photo
 
 LAYERS = ("conv1_1", "conv2_1", "conv3_1")
 

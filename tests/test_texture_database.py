@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from jaxface.geometry.uv import uv_layout
-from jaxface.io.cache import ENVIRONMENT
-from jaxface.io.image import write_png
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
+from jaxface.io.formats.image import write_png
 from jaxface.io.skin_atlas import atlas_uv, read_skin, skin_name
 from jaxface.io.texture_database import (
     INDEX,
@@ -19,8 +18,9 @@ from jaxface.io.texture_database import (
     databases_dir,
     uv_digest,
 )
-from jaxface.pipeline.skin_database import synth_database
-from jaxface.pipeline.texture_import import import_skins
+from jaxface.pipeline.databases.makehuman import import_skins
+from jaxface.pipeline.databases.painted import synth_database
+from jaxface.run.compile_cache import ENVIRONMENT
 
 
 @pytest.fixture(scope="module")

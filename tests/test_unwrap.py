@@ -11,11 +11,11 @@ from jax.test_util import check_grads
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.uv import UVLayout, uv_layout
-from jaxface.render.interpolate import interpolate
-from jaxface.render.rasterize import rasterize
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import rasterize
 from jaxface.render.shading import irradiance
-from jaxface.stages.low_frequency import low_frequency_albedo, over_low_frequency
-from jaxface.stages.unwrap import unwrap
+from jaxface.stages._unwrap import unwrap
+from jaxface.stages.texture.low_frequency import low_frequency_albedo, over_low_frequency
 
 SIZE = 200  # px of the photo
 TEXELS = 160

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxface.models.conv3x3 import conv3x3_relu
-from jaxface.models.features import pool
-from jaxface.models.winograd import transformed_kernel
-from jaxface.models.winograd_tiles import convolve_tiles
+from jaxface.networks.convolution.conv3x3 import conv3x3_relu
+from jaxface.networks.convolution.winograd import transformed_kernel
+from jaxface.networks.convolution.winograd_tiles import convolve_tiles
+from jaxface.networks.texture_features.network import pool
 
 SIDE = 12  # three tiles
 

@@ -16,7 +16,7 @@ from makehuman.source import Archive, read_base_mesh
 from makehuman.topology import cut_head
 
 from jaxface.io.atomic import atomic_path
-from jaxface.io.models import load_model
+from jaxface.io.face_models import load_model
 
 NOT_IN_SKINS = ("eye_l", "eye_r", "helper-upper-teeth", "helper-lower-teeth", "helper-tongue")
 

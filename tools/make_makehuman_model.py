@@ -20,7 +20,7 @@ from makehuman.topology import HeadMesh, cut_head, triangulate
 from scipy.spatial import KDTree
 
 from jaxface.geometry.mesh import vertex_normals
-from jaxface.io.model_file import save_model
+from jaxface.io.face_models.model_file import save_model
 from jaxface.models.landmark_schemes import LEFT_BROW, RIGHT_BROW, landmarks68
 from jaxface.models.linear import LinearBasis
 from jaxface.models.morphable import MorphableModel, SurfacePoints

@@ -12,8 +12,8 @@ from rich.table import Table
 from jaxface import __version__
 from jaxface.cli import textures
 from jaxface.cli.console import bar, console, errors, progress, steps
-from jaxface.io.cache import enable_compilation_cache
-from jaxface.io.memory import keep_freed_memory
+from jaxface.run.compile_cache import enable_compilation_cache
+from jaxface.run.memory import keep_freed_memory
 
 app = typer.Typer(
     name="jaxface", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -107,7 +107,7 @@ def digitize(
     iterations: textures.IterationsOption = 1000,
 ) -> None:
     """The whole journey: fit a photo, complete its albedo, write mesh, maps and report."""
-    from jaxface.pipeline.completion_files import parse_settings
+    from jaxface.pipeline.texture.folder import parse_settings
 
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
     options["self_shadow"] = self_shadow
@@ -149,7 +149,7 @@ def landmarks(
     ] = "mediapipe468",
 ) -> None:
     """Detect faces and their landmarks: JSON and .pts for each face, and a picture."""
-    from jaxface.pipeline.detection import write_detections
+    from jaxface.pipeline.fitting.detection import write_detections
 
     with errors(), progress(f"landmarks of {photo}"):
         count = write_detections(photo, out, scheme)
@@ -159,7 +159,7 @@ def landmarks(
 @model_app.command("list")
 def model_list() -> None:
     """Models that come with the package, and formats that can be read."""
-    from jaxface.io.model_file import bundled_models
+    from jaxface.io.face_models.model_file import bundled_models
 
     for name in bundled_models():
         print(name)
@@ -175,7 +175,7 @@ def model_info(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """What a model holds: sizes, modes, landmarks, regions, licence."""
-    from jaxface.io.models import describe, load_model
+    from jaxface.io.face_models import describe, load_model
 
     with errors():
         facts = describe(load_model(model))
@@ -198,8 +198,8 @@ def model_import(
     ] = None,
 ) -> None:
     """Convert a model of another format into this package's own file."""
-    from jaxface.io.model_file import save_model
-    from jaxface.io.models import describe, load_model
+    from jaxface.io.face_models import describe, load_model
+    from jaxface.io.face_models.model_file import save_model
 
     options = {} if points is None else {"landmarks": points}
     with errors(), progress(f"importing {source}"):
@@ -221,7 +221,7 @@ def model_embed_landmarks(
     out: OutOption,
 ) -> None:
     """Find a model's landmark correspondences by rendering it and running the detector."""
-    from jaxface.pipeline.embedding import embed_landmarks_of
+    from jaxface.pipeline.databases.embedding import embed_landmarks_of
 
     with errors(), progress(f"landmarks of {source}"):
         facts = embed_landmarks_of(source, out)
@@ -253,7 +253,7 @@ def _fit_options(
         if details is not None:
             options["details"] = _integers("--details", details)
         if weights is not None:
-            from jaxface.pipeline.fitting import parse_weights
+            from jaxface.pipeline.fitting._fit import parse_weights
 
             options["weights"] = parse_weights(weights)
     return options

@@ -56,7 +56,7 @@ def texture(
     ] = None,
 ) -> None:
     """Complete the albedo of a digitized photo: analysis, blending, synthesis."""
-    from jaxface.pipeline.completion_files import complete_folder, parse_settings
+    from jaxface.pipeline.texture.folder import complete_folder, parse_settings
 
     with errors(), steps(f"texture of {out}") as on_step:
         settings = parse_settings(
@@ -113,7 +113,7 @@ def database_synth(
     seed: Annotated[int, typer.Option("--seed", help="Of the population.")] = 0,
 ) -> None:
     """Procedural skins (CC0); goes on where an earlier run stopped."""
-    from jaxface.pipeline.skin_database import synth_database
+    from jaxface.pipeline.databases.painted import synth_database
 
     with errors(), steps(f"skins in {out}") as on_step:
         made: Any = synth_database(
@@ -130,7 +130,7 @@ def database_import_skins(
     licence: Annotated[str, typer.Option("--licence", help="Of the skins.")] = "CC0-1.0",
 ) -> None:
     """Bring MakeHuman skins into the default model's UVs."""
-    from jaxface.pipeline.texture_import import import_skins
+    from jaxface.pipeline.databases.makehuman import import_skins
 
     with errors(), steps(f"skins in {out}") as on_step:
         made: Any = import_skins(
@@ -153,7 +153,7 @@ def database_import_scan(
     resolution: Annotated[int, typer.Option("--resolution", help="Texels along a side.")] = 1024,
 ) -> None:
     """Register a head scan to the default topology and add its albedo to a database."""
-    from jaxface.pipeline.scan_import import import_scan
+    from jaxface.pipeline.databases.scan import import_scan
 
     with errors(), steps(str(mesh)) as on_step:
         import_scan(
@@ -189,7 +189,7 @@ def database_build(
     ] = True,
 ) -> None:
     """Albedo textures from a folder of photos; goes on where an earlier run stopped."""
-    from jaxface.pipeline.photo_database import build_database
+    from jaxface.pipeline.databases.from_photos import build_database
 
     told: dict[str, str] = {}
     lost: set[str] = set()
@@ -228,8 +228,8 @@ def database_precompute(
     """Keep what makes comparing a photo with the textures fast; goes on where it stopped."""
     from jaxface.io.feature_weights import load_network
     from jaxface.io.texture_database import TextureDatabase
-    from jaxface.pipeline.completing import ANALYSIS
-    from jaxface.pipeline.gram_database import bytes_to_precompute, precompute
+    from jaxface.pipeline.databases.grams import bytes_to_precompute, precompute
+    from jaxface.pipeline.texture._complete import ANALYSIS
 
     with errors():
         database = TextureDatabase(path)
@@ -271,7 +271,7 @@ def features_train(
     seed: Annotated[int, typer.Option("--seed", help="Of the initial weights and crops.")] = 0,
 ) -> None:
     """Train a feature network without labels; goes on where an earlier run stopped."""
-    from jaxface.pipeline.feature_training import train_features
+    from jaxface.pipeline.training.features import train_features
 
     with errors(), steps(f"features in {out}") as on_step:
         train_features(images, out, steps_, seed, on_step)

@@ -1,4 +1,4 @@
-"""Landmark term ``E_lan`` (Saito 2017, section 3), with contour points that slide.
+"""Landmark term ``E_lan`` (Saito 2017, section 3), over points of the mesh.
 
 ``E_lan = 1/|F| sum_i ||f_i - Pi_P(R V_i + t)||_2^2``. The paper leaves the unit of the distance
 open; here it is the distance between the outer eye corners in the photo (``unit``), so that the
@@ -8,15 +8,10 @@ term means the same at every resolution and pyramid level.
 import equinox as eqx
 import jax.numpy as jnp
 
-from jaxface._types import Array, Float, Int
-from jaxface.geometry.mesh import vertex_normals
+from jaxface._types import Array, Float
 from jaxface.geometry.rotation import rotation_matrix
-from jaxface.imaging.masks import smoothstep
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
-
-GRAZING = (0.1, 0.5)
-"""cosines of the angle to the view at which a landmark does not count, and counts fully"""
 
 
 class LandmarkData(eqx.Module):
@@ -55,57 +50,3 @@ def landmark_residual(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 
     """Residual with ``||r||^2 = E_lan``, the weighted mean of squared distances in ``unit``."""
     share = data.weight / jnp.maximum(jnp.sum(data.weight), 1e-6)
     return jnp.sqrt(share)[:, None] * landmark_difference(y, data) / data.unit
-
-
-def slide_contour(
-    y: FaceParameters,
-    data: LandmarkData,
-    contour: Int[Array, "k"],
-    candidates: Int[Array, "c"],
-    reach: float = 0.35,
-) -> LandmarkData:
-    """Keep to the landmarks that can be seen, and move hidden contour points to the silhouette.
-
-    Where the surface turns away a detector guesses: landmarks off the contour lose their weight
-    between the two cosines of ``GRAZING``. Contour points it places on the outline it sees, and
-    once the head turns the outline is not where the frontal jaw was: a contour landmark whose
-    own surface point faces away from the camera is attached to the candidate vertex on the
-    silhouette that is nearest to its detected position, and loses its weight if none lies within
-    ``reach`` units.
-
-    Args:
-        y: current estimate, held fixed (the choice is discrete; no gradient passes).
-        data: the landmarks.
-        contour: indices of the landmarks that may slide.
-        candidates: vertices that may form the silhouette (face, jaw and neck skin).
-        reach: greatest distance, in ``data.unit``, between a detection and its new point.
-    """
-    model = data.model
-    vertices = model.shape(y.identity, y.expression)
-    rotation = rotation_matrix(y.rotation)
-    normals = vertex_normals(vertices, model.faces) @ rotation.T
-    posed = vertices @ rotation.T + y.translation
-    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
-    facing = jnp.sum(normals * view, axis=-1)
-    own_facing = data.points(facing[:, None])[:, 0]
-    hidden = own_facing[contour] < 0.05
-
-    screen = y.camera(data.principal).project(posed[candidates])[:, :2]
-    target = data.target[contour]
-    distance = jnp.linalg.norm(target[:, None] - screen[None], axis=-1) / data.unit
-    on_silhouette = jnp.abs(facing[candidates]) < 0.25
-    distance = jnp.where(on_silhouette[None], distance, jnp.inf)
-    nearest = jnp.argmin(distance, axis=1)
-    near = jnp.min(distance, axis=1) < reach
-    at_contour = SurfacePoints(data.points.vertices[contour], data.points.weights[contour])
-    slid = jnp.broadcast_to(candidates[nearest][:, None], at_contour.vertices.shape)
-    moved = (hidden & near)[:, None]
-    corner = jnp.array([1.0, 0.0, 0.0], model.mean.dtype)
-    points = SurfacePoints(
-        data.points.vertices.at[contour].set(jnp.where(moved, slid, at_contour.vertices)),
-        data.points.weights.at[contour].set(jnp.where(moved, corner, at_contour.weights)),
-    )
-    seen = smoothstep(own_facing, *GRAZING)
-    seen = seen.at[contour].set(jnp.where(hidden, jnp.where(near, 1.0, 0.0), 1.0))
-    weight = data.weight * seen
-    return eqx.tree_at(lambda d: (d.points, d.weight), data, (points, weight))

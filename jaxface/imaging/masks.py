@@ -1,4 +1,4 @@
-"""Masks of an image: filled polygons, erosion and dilation by a disc, soft edges, the face oval."""
+"""Masks of an image: filled polygons, erosion and dilation by a disc, soft edges."""
 
 import math
 from typing import TypeVar
@@ -7,15 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Bool, Float, Shaped
+from jaxface._types import Array, Bool, Float
 
 Values = TypeVar("Values", Array, np.ndarray)
-
-FACE_OVAL_468 = (
-    *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377),
-    *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
-)
-"""The rim of the 468-point MediaPipe face mesh, in order from the middle of the hairline."""
 
 
 def smoothstep(x: Values, start: float | Values, stop: float | Values) -> Values:
@@ -113,32 +107,3 @@ def feather(mask: Bool[Array, "h w"], width: float) -> Float[Array, "h w"]:
     # A pixel's centre is half a pixel from the edge between it and a neighbour outside.
     limit = math.ceil(width) + 1
     return smoothstep(distance_to(~mask, limit) - 0.5, 0.0, width) * mask
-
-
-def face_oval(landmarks: Float[Array, "l 2"], forehead: float = 0.35) -> Float[Array, "k 2"]:
-    """Polygon around the face from 468 (or 478) or 68 landmarks, pixels.
-
-    The 68 points end at the eyebrows: there, the brows pushed away from the chin by ``forehead``
-    times the height from chin to brows stand for the hairline.
-
-    Raises:
-        ValueError: the number of landmarks is not 68, 468 or 478.
-    """
-    count = landmarks.shape[0]
-    if count in (468, 478):
-        return landmarks[jnp.array(FACE_OVAL_468)]
-    if count != 68:
-        raise ValueError(f"landmarks has {count} points; it needs 68, 468 or 478")
-    jaw, brows = landmarks[:17], landmarks[17:27]
-    up = jnp.mean(brows, axis=0) - jaw[8]
-    # Highest in the middle of the forehead, lower towards the temples.
-    arch = jnp.sin(jnp.linspace(0.15, 0.85, 10, dtype=landmarks.dtype) * jnp.pi)[:, None]
-    return jnp.concatenate([jaw, (brows + forehead * arch * up)[::-1]])
-
-
-def face_oval_mask(
-    landmarks: Float[Array, "l 2"], height: int, width: int, soft: float = 0.0
-) -> Shaped[Array, "h w"]:
-    """Filled face oval; with ``soft`` > 0 its edge rises over that many pixels, inwards."""
-    inside = fill_polygon(face_oval(landmarks), height, width)
-    return feather(inside, soft) if soft > 0 else inside

@@ -6,6 +6,7 @@ in the coordinates too (piecewise).
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Float
 
@@ -74,3 +75,12 @@ def resize(image: Float[Array, "h w c"], height: int, width: int) -> Float[Array
     rows = resize_weights(image.shape[0], height)
     columns = resize_weights(image.shape[1], width)
     return jnp.einsum("rh,hwc,sw->rsc", rows, image, columns, optimize="optimal")
+
+
+def block_means(texture: Float[np.ndarray, "r r c"], side: int) -> Float[np.ndarray, "s s c"]:
+    """Average over blocks of texels, on the host; a texture that is small enough stays as it is."""
+    factor = max(len(texture) // side, 1)
+    if factor == 1:
+        return np.asarray(texture, np.float32)
+    blocks = np.asarray(texture, np.float32).reshape(side, factor, side, factor, -1)
+    return blocks.mean(axis=(1, 3))

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface.io.atomic import atomic_path
-from jaxface.io.cache import cache_dir
-from jaxface.io.gram_cache import digest
-from jaxface.io.restricted_pickle import load_npz, load_pickle
-from jaxface.io.safetensors_file import load_safetensors
-from jaxface.io.torch_file import load_torch_tensors
-from jaxface.models.features import FeatureNetwork, layer_position
-from jaxface.models.random_features import random_network
+from jaxface.io.cache_folder import cache_dir
+from jaxface.io.digest import digest
+from jaxface.io.formats.restricted_pickle import load_npz, load_pickle
+from jaxface.io.formats.safetensors_file import load_safetensors
+from jaxface.io.formats.torch_file import load_torch_tensors
+from jaxface.networks.texture_features.network import FeatureNetwork, layer_position
+from jaxface.networks.texture_features.random_weights import random_network
 
 NAMES = ("random", "random-vgg19", "trained", "vgg16", "vgg19")
 

@@ -5,7 +5,6 @@ the checksum of the rest (CRC-32, 8 hexadecimal digits). The arrays follow, each
 64 bytes, little-endian. The key is a digest of everything the arrays depend on.
 """
 
-import hashlib
 import math
 import os
 import zlib
@@ -14,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxface._types import Array
 from jaxface.io.atomic import atomic_path
 
 _MAGIC = b"jaxface-grams1\n\n"
@@ -109,17 +107,3 @@ class GramCache:
             if total > maximum_bytes and path.stem not in keys:
                 path.unlink(missing_ok=True)
                 total -= size
-
-
-def digest(*parts: str | bytes | np.ndarray | Array) -> str:
-    """32 hexadecimal digits of texts and arrays, with the arrays' shapes and types."""
-    total = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        if isinstance(part, str | bytes):
-            data = part.encode() if isinstance(part, str) else part
-            total.update(f"{len(data)};".encode())
-        else:
-            data = np.ascontiguousarray(part)
-            total.update(f"{data.shape}{data.dtype.str};".encode())
-        total.update(bytes(data))
-    return total.hexdigest()

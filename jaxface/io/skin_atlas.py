@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxface._types import Bool, Float
-from jaxface.io.image import read_image
+from jaxface.io.formats.image import read_image
 from jaxface.models.morphable import MorphableModel
 
 BODY_SIZE = 2048

@@ -27,9 +27,9 @@ from PIL import Image
 from jaxface._types import Float
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.atomic import atomic_path
-from jaxface.io.cache import cache_dir
-from jaxface.io.exr import srgb_encoded
-from jaxface.io.image import write_png
+from jaxface.io.cache_folder import cache_dir
+from jaxface.io.formats.exr import srgb_encoded
+from jaxface.io.formats.image import write_png
 from jaxface.models.morphable import MorphableModel
 
 SCHEMA = "jaxface-textures/1"

@@ -12,12 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Float
-from jaxface.imaging.masks import FACE_OVAL_468
 
 SCHEME_SIZES = {"ibug68": 68, "mediapipe468": 468}
 """number of points of each scheme"""
 
-FACE_OVAL = FACE_OVAL_468
+FACE_OVAL = (
+    *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377),
+    *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
+)
+"""The rim of the 468-point MediaPipe face mesh, in order from the middle of the hairline."""
 """outline of the face (of the 468), clockwise as seen from the top"""
 JAW_68 = range(0, 17)
 """of the 68: the contour, which moves over the surface as the head turns"""

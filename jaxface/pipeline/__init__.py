@@ -4,12 +4,12 @@ Each step is a function of its own and can be replaced: give landmarks, a mask, 
 of your own, or call the stages yourself.
 """
 
-from jaxface.pipeline.clock import Clock
-from jaxface.pipeline.detail_levels import detail_levels
-from jaxface.pipeline.fitting import FittedFace, as_photo, fit
-from jaxface.pipeline.journeys import digitize, digitize_folder, open_photo, photos_in
-from jaxface.pipeline.saving import save_fit
-from jaxface.pipeline.texturing import Texture, texture
+from jaxface.pipeline._digitize import digitize, digitize_folder, open_photo, photos_in
+from jaxface.pipeline.fitting._detail_levels import detail_levels
+from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
+from jaxface.pipeline.fitting.outputs import save_fit
+from jaxface.pipeline.texture.partial import Texture, texture
+from jaxface.run.clock import Clock
 
 __all__ = [
     "Clock",

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float
-from jaxface.energies.gram import StyleTargets, grams, mask_out, style_energy
+from jaxface.energies._gram import StyleTargets, grams, mask_out, style_energy
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.colour import linear_to_srgb, rgb_to_yiq
-from jaxface.models.features import FeatureNetwork
 from jaxface.models.parameters import FaceParameters
-from jaxface.stages.blend import blend_weights
+from jaxface.networks.texture_features.network import FeatureNetwork
+from jaxface.stages._unwrap import PartialAlbedo, unwrap
+from jaxface.stages.blending import blend_weights
 from jaxface.stages.fit import (
     FitConfig,
     FitInput,
@@ -27,7 +28,6 @@ from jaxface.stages.fit import (
     fit_hidden_shading,
     through_levels,
 )
-from jaxface.stages.unwrap import PartialAlbedo, unwrap
 
 
 class TextureWeights(eqx.Module):

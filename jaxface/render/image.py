@@ -9,9 +9,9 @@ from jaxface.geometry.camera import Camera, Pose
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.mipmap import Mipmap
-from jaxface.render.interpolate import interpolate
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import Fragments, rasterize
 from jaxface.render.occlusion import hidden_shading
-from jaxface.render.rasterize import Fragments, rasterize
 from jaxface.render.shading import irradiance
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxface._types import Array, Bool, Float, Int
 from jaxface.geometry.camera import Camera
 from jaxface.geometry.mesh import vertex_normals
-from jaxface.render.rasterize import rasterize
+from jaxface.render._rasterize import rasterize
 from jaxface.render.shading import BAND, sh_basis, sh_basis_on_host
 
 _LOBE = np.array([(1.0, 2.0 / 3.0, 0.25)[band] for band in BAND])

@@ -1,0 +1,8 @@
+"""Stages: one arrow of the diagram each, where an energy meets a solver.
+
+Names are imported when they are first asked for; `__init__.pyi` lists them.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

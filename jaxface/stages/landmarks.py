@@ -13,7 +13,7 @@ from jaxface._types import Array, Float, Shaped
 from jaxface.imaging.pyramid import halve
 from jaxface.imaging.resample import affine_crop
 from jaxface.imaging.windows import PhotoPyramid, tile_corners, unturn
-from jaxface.models.face_detector import (
+from jaxface.networks.landmarks.face_detector import (
     DETECTOR_SIZE,
     Candidates,
     FaceDetector,
@@ -21,7 +21,7 @@ from jaxface.models.face_detector import (
     read_face_detector,
     suppress,
 )
-from jaxface.models.landmarks_net import (
+from jaxface.networks.landmarks.face_mesh import (
     LandmarkNet,
     Region,
     read_landmark_net,

@@ -24,8 +24,13 @@ import optax
 from jax import lax
 
 from jaxface._types import Array, Float
-from jaxface.models.features import STYLE_LAYERS, FeatureNetwork, layer_position, pool
-from jaxface.models.random_features import natural_noise, random_network
+from jaxface.networks.texture_features.network import (
+    STYLE_LAYERS,
+    FeatureNetwork,
+    layer_position,
+    pool,
+)
+from jaxface.networks.texture_features.random_weights import natural_noise, random_network
 
 CROP = 64
 """side of a crop, px"""

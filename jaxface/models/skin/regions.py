@@ -13,8 +13,8 @@ from jaxface.imaging.colour import LUMINANCE
 from jaxface.imaging.masks import smoothstep
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.opening_rims import OpeningRims, opening_rims
+from jaxface.models.regions import NOT_SKIN
 
-NOT_SKIN = ("eyes", "mouth_interior")
 RIM_RINGS = 5
 """rings of vertices inside the mouth that are lip"""
 

@@ -1,10 +1,10 @@
 """Photo -> fitted face (Saito 2017, section 3)."""
 
+from jaxface.stages.fit._cast_shadows import cast_shadows
+from jaxface.stages.fit._posterior import Posterior, posterior
 from jaxface.stages.fit.batch import fit_batch
-from jaxface.stages.fit.cast_shadows import cast_shadows
 from jaxface.stages.fit.levels import fit_parameters, level_stages, through_levels
 from jaxface.stages.fit.photo import WorkingPhoto, input_shapes, working_photo
-from jaxface.stages.fit.posterior import Posterior, posterior
 from jaxface.stages.fit.prepared import FitModel, prepare
 from jaxface.stages.fit.records import (
     FitConfig,

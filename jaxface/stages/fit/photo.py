@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxface._types import Float
 from jaxface.imaging.crop import Crop, crop_face
-from jaxface.imaging.masks import face_oval_mask
+from jaxface.models.face_oval import face_oval_mask
 from jaxface.models.landmark_schemes import CONTOURS, INNER_68, MEDIAPIPE_TO_IBUG68
 from jaxface.stages.fit.records import FitInput
 

@@ -9,12 +9,7 @@ from jaxface.geometry.mesh import boundary_vertices
 from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
 from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
 from jaxface.models.morphable import MorphableModel, SurfacePoints
-
-FACE_REGIONS = ("forehead", "temples", "nose", "cheeks", "chin", "lips", "eyelids", "face")
-"""skin whose colour the photo term compares: not eyeballs, mouth, ears, scalp or neck"""
-
-OUTLINE_REGIONS = (*FACE_REGIONS, "neck", "ears")
-"""skin that may form the outline of the face"""
+from jaxface.models.regions import FACE_REGIONS, OUTLINE_REGIONS
 
 
 class FitModel(eqx.Module):

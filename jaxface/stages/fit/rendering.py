@@ -10,9 +10,9 @@ from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.resample import resize
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
-from jaxface.render.interpolate import interpolate
+from jaxface.render._interpolate import interpolate
+from jaxface.render._rasterize import Fragments, rasterize
 from jaxface.render.occlusion import hidden_shading
-from jaxface.render.rasterize import Fragments, rasterize
 from jaxface.render.shading import irradiance
 from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.prepared import FitModel

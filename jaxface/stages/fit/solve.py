@@ -15,19 +15,9 @@ import jax.numpy as jnp
 
 from jaxface._numerics import safe_norm
 from jaxface._types import Array, Float, Int
-from jaxface.energies.landmark import (
-    LandmarkData,
-    landmark_difference,
-    landmark_residual,
-    slide_contour,
-)
-from jaxface.energies.photometric import (
-    PhotometricData,
-    photometric_energy,
-    synthesize,
-    thin_samples,
-)
-from jaxface.energies.photometric_quadratic import normal_modes, photometric_quadratic
+from jaxface.energies._photometric_quadratic import normal_modes, photometric_quadratic
+from jaxface.energies.landmark import LandmarkData, landmark_difference, landmark_residual
+from jaxface.energies.photometric import PhotometricData, photometric_energy, synthesize
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.energies.term import Energy, Quadratic, Term, compose
 from jaxface.geometry.mesh import vertex_normals
@@ -38,9 +28,10 @@ from jaxface.imaging.resample import bilinear
 from jaxface.models.parameters import FaceParameters, neutral_parameters
 from jaxface.render.occlusion import sh_rotation
 from jaxface.render.shading import sh_basis
-from jaxface.solvers.gauss_newton import Problem, gauss_newton
+from jaxface.solvers._gauss_newton import Problem, gauss_newton
 from jaxface.solvers.solution import Solution
-from jaxface.stages.fit.cast_shadows import cast_shadows, shadow_trust
+from jaxface.stages.fit._cast_shadows import cast_shadows, shadow_trust
+from jaxface.stages.fit.contour import slide_contour
 from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import (
@@ -50,6 +41,7 @@ from jaxface.stages.fit.records import (
     FitWeights,
     LevelRecord,
 )
+from jaxface.stages.fit.samples import thin_samples
 from jaxface.stages.fit.visible import visible_samples
 
 TURNED = 0.94

@@ -3,11 +3,12 @@
 import jax
 
 from jaxface._types import Array, Float, Int
-from jaxface.energies.photometric import PixelSamples, sample_pixels
+from jaxface.energies.photometric import PixelSamples
 from jaxface.models.parameters import FaceParameters
-from jaxface.render.rasterize import rasterize
+from jaxface.render._rasterize import rasterize
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitInput
+from jaxface.stages.fit.samples import sample_pixels
 
 
 def visible_triangles(

@@ -1,0 +1,76 @@
+from ._gram import (
+    DETAIL_WEIGHT,
+    MASKED,
+    StyleTargets,
+    feature_loss,
+    gram,
+    gram_loss,
+    grams,
+    mask_out,
+    style_energy,
+    style_value_and_grad,
+)
+from ._photometric_quadratic import (
+    normal_modes,
+    photometric_jacobian,
+    photometric_quadratic,
+    shape_basis,
+)
+from .known_detail import KnownDetail, known_detail_energy
+from .landmark import LandmarkData, landmark_difference, landmark_residual
+from .photometric import (
+    PhotometricData,
+    PixelSamples,
+    photometric_difference,
+    photometric_energy,
+    photometric_residual,
+    reweighting,
+    synthesize,
+)
+from .prior import focal_residual, light_residual, prior_residual
+from .term import (
+    Energy,
+    Quadratic,
+    Term,
+    compose,
+    quadratic_by_autodiff,
+    sum_of_squares,
+)
+
+__all__ = [
+    "DETAIL_WEIGHT",
+    "Energy",
+    "KnownDetail",
+    "LandmarkData",
+    "MASKED",
+    "PhotometricData",
+    "PixelSamples",
+    "Quadratic",
+    "StyleTargets",
+    "Term",
+    "compose",
+    "feature_loss",
+    "focal_residual",
+    "gram",
+    "gram_loss",
+    "grams",
+    "known_detail_energy",
+    "landmark_difference",
+    "landmark_residual",
+    "light_residual",
+    "mask_out",
+    "normal_modes",
+    "photometric_difference",
+    "photometric_energy",
+    "photometric_jacobian",
+    "photometric_quadratic",
+    "photometric_residual",
+    "prior_residual",
+    "quadratic_by_autodiff",
+    "reweighting",
+    "shape_basis",
+    "style_energy",
+    "style_value_and_grad",
+    "sum_of_squares",
+    "synthesize",
+]

@@ -1,0 +1,1 @@
+"""Drawings, sheets, charts and the report."""

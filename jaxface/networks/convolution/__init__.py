@@ -1,0 +1,1 @@
+"""3x3 convolutions that are fast on processors too."""

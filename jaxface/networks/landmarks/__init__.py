@@ -1,0 +1,1 @@
+"""BlazeFace and the face mesh."""

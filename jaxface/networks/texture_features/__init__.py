@@ -1,0 +1,1 @@
+"""The VGG-like extractor of texture features."""

@@ -1,0 +1,1 @@
+"""Databases of textures: painted, imported, from photos, from scans."""

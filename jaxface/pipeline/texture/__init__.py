@@ -1,0 +1,1 @@
+"""Fitted face -> partial albedo -> complete albedo -> files."""

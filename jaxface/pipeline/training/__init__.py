@@ -1,0 +1,1 @@
+"""Training runs: data in, weights and a report out."""

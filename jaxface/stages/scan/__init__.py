@@ -1,0 +1,1 @@
+"""A head scan into a model's topology and UVs."""

@@ -1,0 +1,1 @@
+"""Textures: what a photo shows, made plausible, mirrored, analysed, synthesised."""
