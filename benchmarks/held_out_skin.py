@@ -85,7 +85,7 @@ class Case:
     def pasted(self, texture: Float[np.ndarray, "r r 3"]) -> Float[np.ndarray, "r r 3"]:
         """A texture with what is seen over it."""
         weight = self.seen.weight[..., None]
-        return weight * self.seen.photo + (1 - weight) * texture
+        return weight * self.seen["photo"] + (1 - weight) * texture
 
 
 def read_truth(folder: str | os.PathLike[str] | None, side: int) -> np.ndarray:
@@ -135,7 +135,7 @@ def make_case(truth: Float[np.ndarray, "r r 3"], name: str) -> Case:
     plain = np.zeros(model.albedo.count, np.float32)
     linear = np.asarray(srgb_to_linear(jnp.asarray(truth)))
     everything = seen_texture(model, linear, np.ones((side, side)), plain, 1.0)
-    free = everything.free
+    free = everything["free"]
     rows, columns = np.nonzero(free)
     v, u = np.mgrid[:side, :side] + 0.5
     if name == "left":
@@ -148,10 +148,10 @@ def make_case(truth: Float[np.ndarray, "r r 3"], name: str) -> Case:
         inside = ((v - middle) / (0.85 * height)) ** 2 + ((u - side / 2) / (0.5 * width)) ** 2 < 1
     else:
         raise ValueError(f"case is {name!r}; needed is 'left', 'right' or 'oval'")
-    depth = distance_transform_edt(inside & everything.skin) / (EDGE * side)
+    depth = distance_transform_edt(inside & everything["skin"]) / (EDGE * side)
     weight = smoothstep(depth, 0.0, 1.0).astype(np.float32) * free
     seen = seen_texture(model, linear, weight, coefficients(model, truth, weight), 1.0)
-    region = np.asarray(model.region)[seen.vertex_of]
+    region = np.asarray(model.region)[seen["vertex"]]
     skipped = [model.region_names.index(n) for n in NOT_MEASURED]
     measured = free & ~np.isin(region, skipped)
     measured = binary_erosion(measured, iterations=max(side // 128, 1))
@@ -163,8 +163,9 @@ def degraded(case: Case, blur: float = 2.0, noise: float = 0.03, seed: int = 0) 
     seen = case.seen
     generator = np.random.default_rng(seed)
     weight = seen.weight[..., None]
-    smooth = gaussian_filter(seen.photo * weight, (blur, blur, 0))
+    smooth = gaussian_filter(seen["photo"] * weight, (blur, blur, 0))
     smooth /= np.maximum(gaussian_filter(weight, (blur, blur, 0)), 1e-3)
-    grain = generator.standard_normal(seen.photo.shape) * noise
+    grain = generator.standard_normal(seen["photo"].shape) * noise
     photo = np.clip(smooth + grain, 0, 1).astype(np.float32)
-    return replace(case, seen=replace(seen, photo=np.where(weight > 0, photo, seen.photo)))
+    poor = seen.maps["photo"]._replace(values=np.where(weight > 0, photo, seen["photo"]))
+    return replace(case, seen=replace(seen, maps=seen.maps.with_maps(photo=poor)))

@@ -28,9 +28,10 @@ from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import load_network
 from jaxface.networks.texture_features.network import STYLE_LAYERS
 from jaxface.pipeline.databases.painted import synth_database
-from jaxface.pipeline.texture._complete import Completed, CompletionSettings, complete
+from jaxface.pipeline.texture._complete import complete
+from jaxface.pipeline.texture.options import CompletionOptions
+from jaxface.pipeline.texture.records import Completed
 from jaxface.stages.blending import blend, nearest_subject, unconstrained
-from jaxface.stages.texture._synthesise import SynthesisWeights
 from jaxface.stages.texture.detail import COMPLEXION, with_complexion
 
 SIDE, ITERATIONS = 512, 60
@@ -75,13 +76,12 @@ def variants(vgg: Path | None) -> Iterator[Variant]:
         yield Variant("features", f"random, 3 layers, {case}", {"layers": STYLE_LAYERS[:3]},
                       case=case)  # fmt: skip
     for photo in (0.0, 300.0):
-        weights = SynthesisWeights(photo=photo)
-        yield Variant("kept photo", f"{photo:g}", {"weights": weights})
+        yield Variant("kept photo", f"{photo:g}", {"keep_photo": photo})
     yield Variant("start", "low_frequency", {"start": "low_frequency"})
     yield Variant("complexion", "as they are", {"match_complexion": False})
     yield Variant("paper", "all of the paper's", {
         "match_complexion": False, "start": "low_frequency", "carry": None,
-        "weights": SynthesisWeights(photo=0.0),
+        "keep_photo": 0.0,
     })  # fmt: skip
     yield Variant("database", "imported", painted=False, imported=True)
     yield Variant("database", "both", imported=True)
@@ -144,7 +144,7 @@ class Bench:
         case = self.case(variant.case)
         case = degraded(case) if variant.poor else case
         settings = replace(
-            CompletionSettings(), iterations=self.options.iterations, **variant.settings
+            CompletionOptions(), iterations=self.options.iterations, **variant.settings
         )
         started = time.perf_counter()
         done = complete(
@@ -161,7 +161,7 @@ class Bench:
         return values, done, case
 
     def blending(
-        self, variant: Variant, settings: CompletionSettings, how: Callable[..., Any]
+        self, variant: Variant, settings: CompletionOptions, how: Callable[..., Any]
     ) -> Any:
         """A blend from an analysis that was made before, or the function to make it with."""
         same = (
@@ -181,17 +181,17 @@ class Bench:
     def baselines(self, variant: Variant, done: Completed, case: Case) -> dict[str, Any]:
         """What a completion must beat, and what no completion knows."""
         skins, rows = self.database(variant), {}
-        rows["low frequencies"] = case.seen.low_frequency
+        rows["low frequencies"] = case.seen["low_frequency"]
         plain, own = {}, {}
         network = load_network(variant.features)
         for settings, found in (({"match_complexion": False}, plain), ({}, own)):
-            given = replace(CompletionSettings(), iterations=1, **settings)
+            given = replace(CompletionOptions(), iterations=1, **settings)
             how = self.blending(variant, given, nearest_subject)
             chosen = complete(case.seen, skins, network, given, blending=how)
             found["name"] = skins.names[int(np.argmax(chosen.blended.weights))]
         rows["nearest subject"] = skins.encoded(plain["name"])
         detail = with_complexion(
-            jnp.asarray(skins.encoded(own["name"])), jnp.asarray(case.seen.low_frequency),
+            jnp.asarray(skins.encoded(own["name"])), jnp.asarray(case.seen["low_frequency"]),
             self.side * COMPLEXION,
         )  # fmt: skip
         rows["nearest subject's detail on the complexion"] = np.asarray(detail)
@@ -259,7 +259,7 @@ def main() -> None:
             continue
         values, done, case = bench.complete(variant)
         keep(variant.group, variant.name, values)
-        panels = [case.pasted(case.seen.low_frequency), done.start, done.albedo, case.truth]
+        panels = [case.pasted(case.seen["low_frequency"]), done.start, done.albedo, case.truth]
         if variant.group == "core":
             for name, texture in bench.baselines(variant, done, case).items():
                 keep("core", f"{name}, {variant.case}", bench.measured(texture, case))

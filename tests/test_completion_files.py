@@ -11,8 +11,9 @@ from jaxface.io.formats.gltf import write_glb
 from jaxface.io.formats.retexture import retexture_glb, retexture_obj
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.parameters import neutral_parameters
-from jaxface.pipeline.texture.folder import check_inputs, parse_settings
-from jaxface.pipeline.texture.seen import model_of
+from jaxface.pipeline.texture.folder import open_inputs
+from jaxface.pipeline.texture.options import CompletionOptions, parse_detail
+from jaxface.pipeline.texture.seen import fitted_model, read_folder_fit
 
 SIZE = 256
 
@@ -33,21 +34,28 @@ def database(tmp_path_factory, model):
 
 
 def test_what_cannot_be_completed_is_told_beforehand(database, model, tmp_path):
-    check_inputs(model, SIZE, database.path)
-    check_inputs(dataclasses.replace(model, name="other"), SIZE, database.path)
+    opened = open_inputs(model, SIZE, database.path)
+    assert opened.database is not None and opened.database.names == database.names
+    again = open_inputs(model, SIZE, opened.database, opened.network)
+    assert again.database is opened.database and again.network is opened.network
+    assert open_inputs(model, SIZE).database is None
+    open_inputs(dataclasses.replace(model, name="other"), SIZE, database.path)
     with pytest.raises(ValueError, match="256 or more"):
-        check_inputs(model, SIZE - 1, database.path)
+        open_inputs(model, SIZE - 1, database.path)
     with pytest.raises(ValueError, match="1 subjects; 2 are needed"):
         alone = TextureDatabase.create(tmp_path, model, SIZE, name="alone", licence="CC0-1.0")
         alone.write_subject("s", np.full((SIZE, SIZE, 3), 0.5))
-        check_inputs(model, SIZE, tmp_path)
+        open_inputs(model, SIZE, tmp_path)
     with pytest.raises(ValueError, match="UV"):
-        check_inputs(dataclasses.replace(model, uv=model.uv[::-1]), SIZE, database.path)
+        open_inputs(dataclasses.replace(model, uv=model.uv[::-1]), SIZE, database.path)
 
 
 def test_a_fit_of_another_model_is_named(model, tmp_path):
     def fitted(face, name):
         write_fit(tmp_path / "fit.npz", neutral_parameters(face), {}, {"model": name})
+
+    def model_of(folder, given=None):
+        return fitted_model(folder, read_folder_fit(folder), given)
 
     fitted(model, "makehuman")
     assert model_of(tmp_path) is not None and model_of(tmp_path, model) is model
@@ -68,23 +76,42 @@ def test_a_fit_of_another_model_is_named(model, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"norm": "max"}, "norm is"),
+        ({"norm": "max"}, "norm is 'max'"),
         ({"iterations": 0}, "at least one"),
-        ({"alpha": -1.0}, "weights of 0 or more"),
+        ({"alpha": -1.0}, "alpha is -1.0; weights of 0 or more"),
         ({"start": "noise"}, "start is"),
-        ({"detail": "lips"}, "region=value"),
-        ({"photo": -1.0}, "weights of 0 or more"),
+        ({"detail": {"lips": 2.0}}, "detail of 'lips' is 2.0"),
+        ({"keep_photo": float("nan")}, "weights of 0 or more"),
+        ({"layers": ()}, "at least one layer"),
+        ({"extent": "ears"}, "'face' or 'whole'"),
     ],
 )
-def test_settings_are_checked(given, message):
+def test_options_are_checked(given, message):
     with pytest.raises(ValueError, match=message):
-        parse_settings(**given)
+        CompletionOptions(**given)
 
 
-def test_settings_from_a_command_line():
-    settings = parse_settings(detail="lips=0.5, nose=0", photo=3.0, iterations=7)
-    assert settings.detail == {"lips": 0.5, "nose": 0.0}
-    assert settings.weights.photo == 3.0 and settings.iterations == 7
+def test_a_misspelt_option_is_a_type_error():
+    with pytest.raises(TypeError, match="iteration"):
+        CompletionOptions(**{"iteration": 7})
+
+
+def test_detail_from_a_command_line():
+    assert parse_detail("lips=0.5, nose=0") == {"lips": 0.5, "nose": 0.0}
+    with pytest.raises(ValueError, match="region=value"):
+        parse_detail("lips")
+
+
+def test_as_published_differs_from_the_default_in_every_departure():
+    default, paper = CompletionOptions(), CompletionOptions.as_published()
+    same = {
+        field.name
+        for field in dataclasses.fields(CompletionOptions)
+        if getattr(default, field.name) == getattr(paper, field.name)
+    }
+    # Equation 2's norm, equation 3's alpha and layers are the paper's by default.
+    assert same == {"alpha", "norm", "iterations", "layers", "keep_plain", "detail"}
+    assert paper.alpha == 2000 and paper.norm == "frobenius"
 
 
 def test_another_texture_for_a_mesh_on_disk(tmp_path, model):

@@ -16,8 +16,8 @@ from jaxface.io.texture_database import (
     SCHEMA,
     TextureDatabase,
     databases_dir,
-    uv_digest,
 )
+from jaxface.models.maps import uv_digest
 from jaxface.pipeline.databases.makehuman import import_skins
 from jaxface.pipeline.databases.painted import synth_database
 from jaxface.run.compile_cache import ENVIRONMENT

@@ -107,15 +107,15 @@ def digitize(
     iterations: textures.IterationsOption = 1000,
 ) -> None:
     """The whole journey: fit a photo, complete its albedo, write mesh, maps and report."""
-    from jaxface.pipeline.texture.folder import parse_settings
+    from jaxface.pipeline.texture.options import CompletionOptions
 
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
     options["self_shadow"] = self_shadow
     with errors():
-        settings = parse_settings(iterations=iterations)
+        settings = CompletionOptions(iterations=iterations)
     _run(
         photo, out, with_texture=True, resolution=resolution, complete=complete, completion={
-            "database": database, "features": features, "settings": settings
+            "database": database, "features": features, "options": settings
         }, **options,
     )  # fmt: skip
 

@@ -45,9 +45,9 @@ def texture(
         typer.Option("--detail", help="Detail by region from 0 to 1, as lips=0.5,nose=1."),
     ] = None,
     keep_photo: Annotated[
-        float | None,
+        float,
         typer.Option("--keep-photo", help="Weight of what the photo shows; 0 as in the paper."),
-    ] = None,
+    ] = 30.0,
     start: Annotated[
         str, typer.Option("--start", help="neighbour, or low_frequency as in the paper.")
     ] = "neighbour",
@@ -56,15 +56,16 @@ def texture(
     ] = None,
 ) -> None:
     """Complete the albedo of a digitized photo: analysis, blending, synthesis."""
-    from jaxface.pipeline.texture.folder import complete_folder, parse_settings
+    from jaxface.pipeline.texture.folder import complete_folder
+    from jaxface.pipeline.texture.options import CompletionOptions, parse_detail
 
     with errors(), steps(f"texture of {out}") as on_step:
-        settings = parse_settings(
-            alpha=alpha, norm=norm, iterations=iterations, detail=detail, photo=keep_photo,
-            start=start,
+        settings = CompletionOptions(
+            alpha=alpha, norm=norm, iterations=iterations, start=start,
+            detail=parse_detail(detail) if detail else {}, keep_photo=keep_photo,
         )  # fmt: skip
         done = complete_folder(
-            out, database=database, features=features, resolution=resolution, settings=settings,
+            out, database=database, features=features, resolution=resolution, options=settings,
             model=model, on_step=on_step,
         )  # fmt: skip
     console.print(

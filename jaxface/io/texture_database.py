@@ -11,7 +11,6 @@ Every file is written whole or not at all, a texture before the entry that names
 interrupted run leaves a valid database that a later run completes.
 """
 
-import hashlib
 import json
 import os
 import re
@@ -30,6 +29,7 @@ from jaxface.io.atomic import atomic_path
 from jaxface.io.cache_folder import cache_dir
 from jaxface.io.formats.exr import srgb_encoded
 from jaxface.io.formats.image import write_png
+from jaxface.models.maps import uv_digest
 from jaxface.models.morphable import MorphableModel
 
 SCHEMA = "jaxface-textures/1"
@@ -286,13 +286,6 @@ def check_name(name: str) -> None:
             f"subject name {name!r}; it needs 1 to 100 letters, digits, '.', '_' or '-', "
             "beginning with a letter or digit"
         )
-
-
-def uv_digest(model: MorphableModel) -> str:
-    """Digest of a model's texture coordinates and their triangles, the same on any machine."""
-    uv = np.round(np.asarray(model.uv, np.float64) * 2**20).astype("<i8")
-    faces = np.asarray(model.uv_faces).astype("<i8")
-    return hashlib.blake2b(uv.tobytes() + faces.tobytes(), digest_size=16).hexdigest()
 
 
 def databases_dir() -> Path:

@@ -16,9 +16,10 @@ from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
 from jaxface.pipeline.fitting.outputs import save_fit
 from jaxface.pipeline.texture.folder import (
     PAINTED_MODEL,
+    CompletionInputs,
     OnStep,
-    check_inputs,
     complete_folder,
+    open_inputs,
     silent,
 )
 from jaxface.pipeline.texture.partial import texture
@@ -78,9 +79,11 @@ def digitize(
         FileNotFoundError: a file that does not exist.
     """
     options["model"] = model = _loaded(options)
-    completing = complete and with_texture and _can_complete(model, resolution, completion or {})
+    inputs = None
+    if complete and with_texture:
+        inputs = _completion_inputs(model, resolution, completion or {})
     return _digitize(
-        photo, out, completion or {}, completing, resolution=resolution, with_texture=with_texture,
+        photo, out, completion or {}, inputs, resolution=resolution, with_texture=with_texture,
         on_step=on_step, title=title, landmarks_file=landmarks_file, mask_file=mask_file,
         **options,
     )  # fmt: skip
@@ -90,7 +93,7 @@ def _digitize(
     photo: str | os.PathLike[str] | Photo | np.ndarray,
     out: str | os.PathLike[str],
     completion: Mapping[str, Any],
-    completing: bool,
+    inputs: CompletionInputs | None,
     *,
     resolution: int = 2048,
     with_texture: bool = True,
@@ -111,9 +114,15 @@ def _digitize(
     textured = texture(fitted, resolution) if with_texture else None
     save_fit(fitted, out, textured=textured, title=title or "photo")
     del textured
-    if completing:
-        complete_folder(out, on_step=on_step, **{"model": options["model"], **completion})
+    if inputs is not None:
+        complete_folder(out, on_step=on_step, **_resources(options["model"], completion, inputs))
     return fitted
+
+
+def _resources(
+    model: MorphableModel, completion: Mapping[str, Any], inputs: CompletionInputs
+) -> dict[str, Any]:
+    return {"model": model, **completion, "database": inputs.database, "features": inputs.network}
 
 
 def _loaded(options: Mapping[str, Any]) -> MorphableModel:
@@ -121,11 +130,13 @@ def _loaded(options: Mapping[str, Any]) -> MorphableModel:
     return model if isinstance(model, MorphableModel) else load_model(model)
 
 
-def _can_complete(model: MorphableModel, resolution: int, completion: Mapping[str, Any]) -> bool:
-    """Whether a completion can follow the fit, told before hours are spent.
+def _completion_inputs(
+    model: MorphableModel, resolution: int, completion: Mapping[str, Any]
+) -> CompletionInputs | None:
+    """What a completion after the fit needs, opened before hours are spent; None if none can be.
 
     Raises:
-        ValueError: as `check_inputs`.
+        ValueError: as `open_inputs`.
         FileNotFoundError: likewise.
     """
     database = completion.get("database")
@@ -135,10 +146,9 @@ def _can_complete(model: MorphableModel, resolution: int, completion: Mapping[st
             f"and no database in the UVs of {model.name!r} is named",
             stacklevel=3,
         )
-        return False
+        return None
     side = completion.get("resolution") or resolution
-    check_inputs(model, side, database, completion.get("features", "random"))
-    return True
+    return open_inputs(model, side, database, completion.get("features", "random"))
 
 
 class FolderEntry(NamedTuple):
@@ -198,15 +208,17 @@ def digitize_folder(
     completion, complete = options.pop("completion", None) or {}, options.pop("complete", False)
     with_texture, resolution = options.get("with_texture", True), options.get("resolution", 2048)
     options["model"] = model = _loaded(options)
-    completing = complete and with_texture and _can_complete(model, resolution, completion)
+    inputs = None
+    if complete and with_texture:
+        inputs = _completion_inputs(model, resolution, completion)
     for photo, folder in zip(photos, folders, strict=True):
         on_start(photo)
         fitted = None
         try:
             if not (folder / "report.json").is_file():
-                fitted = _digitize(photo, folder, completion, completing, **options)
-            elif completing and not (folder / "albedo.png").is_file():
-                complete_folder(folder, **{"model": model, **completion})
+                fitted = _digitize(photo, folder, completion, inputs, **options)
+            elif inputs is not None and not (folder / "albedo.png").is_file():
+                complete_folder(folder, **_resources(model, completion, inputs))
             yield FolderEntry(photo, folder, fitted, None)
         except (ValueError, FileNotFoundError) as error:
             yield FolderEntry(photo, folder, None, str(error))

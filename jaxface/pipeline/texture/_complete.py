@@ -1,62 +1,53 @@
 """Partial albedo -> complete albedo: analysis, blending, synthesis (Saito 2017, secs. 4 to 6)."""
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxface._types import Array, Bool, Float
-from jaxface.energies._gram import StyleTargets, grams, mask_out
-from jaxface.energies.known_detail import KnownDetail
-from jaxface.imaging.colour import rgb_to_yiq
-from jaxface.imaging.push_pull import push_pull
-from jaxface.imaging.resample import block_means, resize
+from jaxface.energies._gram import StyleTargets
+from jaxface.imaging.resample import block_means
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.networks.texture_features.network import FeatureNetwork
-from jaxface.networks.texture_features.tiles import even_tile
-from jaxface.pipeline.texture.completion_levels import faded, level_steps, nearest_positive
-from jaxface.pipeline.texture.records import (
-    Blending,
-    Completed,
-    CompletionSettings,
-    Level,
-    Progress,
-)
+from jaxface.pipeline.databases.grams import find_precomputed, masked_grams
+from jaxface.pipeline.texture.options import CompletionOptions
+from jaxface.pipeline.texture.records import Blending, Completed, Level, Progress
 from jaxface.pipeline.texture.seen import SeenTexture
 from jaxface.run.memory import hand_back_freed_memory
 from jaxface.stages.blending import Blend, blend
-from jaxface.stages.texture._synthesise import SynthesisProblem, synthesise
-from jaxface.stages.texture.detail import (
-    COMPLEXION,
-    with_complexion,
-    with_intensity,
-    with_photo,
-    without_marks,
+from jaxface.stages.texture._synthesise import SynthesisProblem, SynthesisWeights, synthesise
+from jaxface.stages.texture.composition import (
+    PHOTO_BLUR,
+    composed,
+    first_intensity,
+    known_detail,
+    start_texture,
+    with_seen,
 )
-from jaxface.stages.texture.octaves import with_photos_octaves
+from jaxface.stages.texture.resolutions import free_box, level_steps, resolutions
+from jaxface.stages.texture.seen_level import SeenLevel
+from jaxface.stages.texture.statistics import (
+    Departure,
+    box_tile,
+    carried_gain,
+    kept_weights,
+    masked_statistics,
+    subject_texture,
+    target_statistics,
+)
 
-COARSEST = 256
 ANALYSIS = 512
-"""greatest resolution at which photo and database are compared"""
-
-PHOTO_BLUR = 0.6
-"""standard deviation of the low-pass that passes what a photo holds, in its pixels"""
-
-LARGEST_GAIN = 3.0
-"""by which what a small part of the face shows is taken to hold for the whole"""
-
-LARGEST_WHOLE = 1 << 20
-"""texels up to which statistics are taken in one piece; beyond, in tiles"""
+"""greatest resolution at which photo and database are compared, unless it is that of the maps"""
 
 
 def complete(
     seen: SeenTexture,
     database: TextureDatabase,
     network: FeatureNetwork,
-    settings: CompletionSettings | None = None,
+    options: CompletionOptions | None = None,
     *,
     blending: Blending | Blend = blend,
     on_progress: Progress = lambda what, done, of, picture: None,
@@ -72,9 +63,9 @@ def complete(
         seen: what the photo shows, at the resolution wanted.
         database: textures in the same UVs.
         network: extractor of features.
-        settings: see `CompletionSettings`.
-        blending: how statistics are blended, of the arguments of `stages.blend.blend`; for
-            instance ``nearest_subject``; or a blend that is known already.
+        options: see `CompletionOptions`.
+        blending: how statistics are blended, of the arguments of `stages.blend`; for instance
+            ``nearest_subject``; or a blend that is known already.
         on_progress: told of every step.
         resumed: a level (texels along a side) that an earlier run has finished.
         finished: told of every finished level.
@@ -82,10 +73,10 @@ def complete(
     Raises:
         ValueError: the database has fewer than two subjects, or the photo shows no skin.
     """
-    settings = settings or CompletionSettings()
+    options = options or CompletionOptions()
     check_subjects(database)
-    work = _Work(seen, database, network, settings, on_progress, blending)
-    blended = work.blend()
+    work = _Work(seen, database, network, options, on_progress)
+    blended = blending if isinstance(blending, Blend) else work.blend(blending)
     order = np.argsort(-blended.weights)
     used = [int(i) for i in order if abs(blended.weights[i]) > 1e-3]
     records: list[dict[str, Any]] = []
@@ -94,20 +85,21 @@ def complete(
         hand_back_freed_memory()
         start = work.start(level, used[0])
         done = resumed(level)
-        if done is None or done.image.shape != work.cut(start, level).shape[:2]:
+        if done is None or done.image.shape != start[work.box(level)].shape[:2]:
             done = work.synthesise(level, start, last.image, blended, used, index)
             finished(level, done)
         records.append(done.record)
         last = done
     return Completed(
-        work.compose(start, last.image),
-        start,
-        blended,
-        database.names,
-        work.analysis_level,
-        last.targets,
-        work.box(work.levels[-1]),
-        records,
+        albedo=work.compose(start, last.image),
+        start=start,
+        blended=blended,
+        names=database.names,
+        analysed_at=work.analysis_level,
+        compared_by=work.compared_by,
+        targets=last.targets,
+        box=work.box(work.levels[-1]),
+        levels=records,
     )
 
 
@@ -115,19 +107,6 @@ def check_subjects(database: TextureDatabase) -> None:
     """Raise a ValueError if a database has too few subjects to blend."""
     if len(database) < 2:
         raise ValueError(f"database {database.name!r} has {len(database)} subjects; 2 are needed")
-
-
-class _Maps(NamedTuple):
-    """What was seen, at one level."""
-
-    photo: Float[Array, "r r 3"]
-    """what the photo shows, sRGB-encoded"""
-    weight: Float[Array, "r r"]
-    """how far it is to be trusted"""
-    low_frequency: Float[Array, "r r 3"]
-    mask: Bool[np.ndarray, "r r"]
-    """texels to be synthesised"""
-    plain: Float[Array, "r r"]
 
 
 class _Work:
@@ -138,27 +117,19 @@ class _Work:
         seen: SeenTexture,
         database: TextureDatabase,
         network: FeatureNetwork,
-        settings: CompletionSettings,
+        options: CompletionOptions,
         on_progress: Progress,
-        blending: Blending | Blend,
     ) -> None:
         self.seen, self.database, self.network = seen, database, network
-        self.settings, self.on_progress, self.blending = settings, on_progress, blending
-        self._detail = seen.detail_map(settings.detail)
-        self.levels = [seen.resolution]
-        while self.levels[0] >= 2 * COARSEST and self.levels[0] % 2 == 0:
-            self.levels.insert(0, self.levels[0] // 2)
-        rows, columns = np.nonzero(seen.free)
-        grain = seen.resolution // self.levels[0] * 16
-        low = (np.array([rows.min(), columns.min()]) // grain - 1).clip(0) * grain
-        high = (np.array([rows.max(), columns.max()]) // grain + 2) * grain
-        self._box = low, high.clip(max=seen.resolution)
+        self.options, self.on_progress = options, on_progress
+        self._detail = seen.detail_map(options.detail)
+        side = seen.resolution
+        self.levels = resolutions(side) if options.coarse_to_fine else [side]
+        self._box = free_box(seen["free"], self.levels)
         sharp = [r for r in self.levels if r <= ANALYSIS and self._texels(r) <= 1.5]
-        self.analysis_level = max(sharp, default=self.levels[0])
-        self._grams = jax.jit(
-            lambda net, image, tile: grams(net, image, settings.layers, tile),
-            static_argnums=2,
-        )
+        by_photo = max(sharp, default=self.levels[0])
+        self.analysis_level = side if options.compare_at == "maps" else by_photo
+        self.compared_by = "network"
         # One level's alone: whole maps of every level would add up.
         self.maps = functools.lru_cache(maxsize=1)(self._maps)
 
@@ -168,103 +139,94 @@ class _Work:
 
     def box(self, level: int) -> tuple[slice, slice]:
         factor = self.seen.resolution // level
-        (top, left), (bottom, right) = (corner // factor for corner in self._box)
-        return slice(int(top), int(bottom)), slice(int(left), int(right))
+        (top, left), (bottom, right) = self._box
+        return slice(top // factor, bottom // factor), slice(left // factor, right // factor)
 
-    def tile(self, level: int) -> int | None:
-        """Side of the tiles in which a level's statistics are summed; None for the whole box."""
-        height, width = (part.stop - part.start for part in self.box(level))
-        return even_tile((height, width)) if height * width > LARGEST_WHOLE else None
+    def _mean(self, kind: str, level: int) -> Float[np.ndarray, "r r c"]:
+        return self.seen.maps.reduced(kind, level)[0]
 
-    def cut(self, texture: Any, level: int) -> Any:
-        return texture[self.box(level)]
-
-    def _maps(self, level: int) -> _Maps:
-        seen = self.seen
-        weight = block_means(seen.weight[..., None], level)
-        colour = block_means(seen.photo * seen.weight[..., None], level)
-        return _Maps(
-            jnp.asarray(colour / np.maximum(weight, 1e-3)),
-            jnp.asarray(weight[..., 0]),
-            jnp.asarray(block_means(seen.low_frequency, level)),
-            block_means(seen.free[..., None].astype(np.float32), level)[..., 0] > 0.5,
-            jnp.asarray(block_means(seen.plain[..., None], level)[..., 0]),
+    def _maps(self, level: int) -> SeenLevel:
+        photo, weight = self.seen.maps.reduced("photo", level)
+        return SeenLevel(
+            jnp.asarray(photo),
+            jnp.asarray(weight),
+            jnp.asarray(self._mean("low_frequency", level)),
+            self._mean("free", level)[..., 0] > 0.5,
+            jnp.asarray(self._mean("plain", level)[..., 0]),
+            self._texels(level),
         )
 
     def subject(self, index: int, level: int, strong: bool = True) -> Array:
-        """A subject's texture at a level, on the photo's complexion if the settings say so.
-
-        With ``strong`` also with detail as strong as the photo's: not where they are compared.
-        """
+        """A subject's texture at a level; ``strong``: as blended and started from, not compared."""
         texture = block_means(self.database.encoded(self.database.names[index]), level)
-        if texture.shape[0] < level:
-            texture = resize(jnp.asarray(texture), level, level)
-        if not self.settings.match_complexion:
-            return jnp.asarray(texture)
-        seen = self.maps(level)
-        bare = without_marks(jnp.asarray(texture), seen.plain, level * COMPLEXION)
-        own = with_complexion(bare, seen.low_frequency, level * COMPLEXION)
-        if not (strong and self.settings.match_octaves):
-            return own
-        weight = seen.weight * seen.mask
-        return with_photos_octaves(own, seen.photo, weight, self._texels(level))
+        return subject_texture(
+            texture, self.maps(level), self.options.match_complexion,
+            strong and self.options.match_octaves,
+        )  # fmt: skip
 
-    def statistics(self, texture: Array, mask: np.ndarray, level: int) -> dict[str, Array]:
-        """Gram matrices of a texture's intensity, masked out beyond a mask, in the box."""
-        shown = mask_out(rgb_to_yiq(texture)[..., 0], jnp.asarray(mask))
-        return self._grams(self.network, self.cut(shown, level), self.tile(level))
+    def statistics(
+        self, texture: Array, mask: Bool[np.ndarray, "r r"], level: int
+    ) -> dict[str, Array]:
+        return masked_statistics(self.network, texture, mask, self.box(level), self.options.layers)
 
-    def blend(self) -> Blend:
+    def blend(self, blending: Blending) -> Blend:
         """Section 4: compare what the photo shows with the same part of every subject."""
-        if isinstance(self.blending, Blend):
-            return self.blending
-        level, count = self.analysis_level, len(self.database)
+        level = self.analysis_level
         seen = self.maps(level)
         mask = seen.mask & (np.asarray(seen.weight) > 0.5)
         if mask.sum() < 100:
             raise ValueError("the photo shows next to no skin of the face that could be analysed")
-        target = self.statistics(seen.photo, mask, level)
-        stacks: dict[str, list[np.ndarray]] = {name: [] for name in target}
-        for index in range(count):
+        goal = {n: np.asarray(g) for n, g in self.statistics(seen.photo, mask, level).items()}
+        columns = self._precomputed(mask, level) or self._compared(mask, tuple(goal))
+        return blending(columns, goal, norm=self.options.norm)
+
+    def _precomputed(
+        self, mask: Bool[np.ndarray, "r r"], level: int
+    ) -> dict[str, Float[np.ndarray, "k n n"]] | None:
+        """From what `precompute` keeps, which is of the subjects as they are, in whole maps."""
+        whole = self.box(level) == (slice(0, level), slice(0, level))
+        if self.options.match_complexion or not whole or self.database.resolution % level:
+            return None
+        cache = find_precomputed(self.database, self.network, level, layers=self.options.layers)
+        if cache is None:
+            return None
+        self.compared_by = "cache"
+
+        def tell(done: int, of: int) -> None:
+            self.on_progress("analysis from kept statistics", done, of, None)
+
+        return masked_grams(cache, mask, tell)
+
+    def _compared(
+        self, mask: Bool[np.ndarray, "r r"], layers: Sequence[str]
+    ) -> dict[str, Float[np.ndarray, "k n n"]]:
+        stacks: dict[str, list[np.ndarray]] = {name: [] for name in layers}
+        for index in range(len(self.database)):
             for name, value in self.analysed(index, mask).items():
                 stacks[name].append(np.asarray(value))
-            self.on_progress("analysis", index + 1, count, None)
-        columns = {name: np.stack(values) for name, values in stacks.items()}
-        goal = {name: np.asarray(value) for name, value in target.items()}
-        return self.blending(columns, goal, norm=self.settings.norm)
+            self.on_progress("analysis", index + 1, len(self.database), None)
+        return {name: np.stack(values) for name, values in stacks.items()}
 
-    def analysed(self, index: int, mask: np.ndarray) -> dict[str, Array]:
+    def analysed(self, index: int, mask: Bool[np.ndarray, "r r"]) -> dict[str, Array]:
         """A subject's Gram matrices as they are compared with the photo's."""
         level = self.analysis_level
         return self.statistics(self.subject(index, level, strong=False), mask, level)
 
     def targets(self, level: int, blended: Blend, used: list[int]) -> dict[str, Array]:
-        """The complete Gram matrices ``sum_k w_k G(I_k)``."""
-        # What was left out is made up for, so that the sum of the weights stays as it was.
-        weights = blended.weights[used] * (blended.weights.sum() / blended.weights[used].sum())
-        total: dict[str, Array] = {}
-        mask, carry = self.maps(level).mask, self.settings.carry
-        for share, index in zip(weights, used, strict=True):
-            texture = self.subject(index, level)
-            found = self.statistics(texture, mask, level)
-            if carry is not None:
-                own = self.statistics(self.with_photo(texture, level), mask, level)
-                gain = self.gain(level, carry)
-                found = {name: g + gain * (own[name] - g) for name, g in found.items()}
-            for name, value in found.items():
-                total[name] = share * value + total.get(name, 0.0)
-        return {name: nearest_positive(value) for name, value in total.items()}
+        """The complete Gram matrices ``sum_k w_k G(I_k)`` over the subjects that are used."""
+        seen, carry = self.maps(level), self.options.carry
 
-    def gain(self, level: int, carry: float) -> float:
-        """What the seen skin's departure counts: 1, or as if the whole face departed like it."""
-        seen = self.maps(level)
-        weight = np.asarray(seen.weight)[seen.mask]
-        return 1 + carry * min(1 / max(float(weight.mean()), 1e-3) - 1, LARGEST_GAIN - 1)
+        def found() -> Iterator[Departure]:
+            for index in used:
+                texture = self.subject(index, level)
+                own = None if carry is None else with_seen(texture, seen)
+                yield (
+                    self.statistics(texture, seen.mask, level),
+                    None if own is None else self.statistics(own, seen.mask, level),
+                )
 
-    def with_photo(self, texture: Array, level: int) -> Array:
-        """A texture with the frequencies that the photo holds, where it is seen."""
-        seen = self.maps(level)
-        return with_photo(texture, seen.photo, seen.weight, PHOTO_BLUR * self._texels(level))
+        gain = 1.0 if carry is None else carried_gain(seen, carry)
+        return target_statistics(kept_weights(blended.weights, used), found(), gain)
 
     def detail(self, level: int) -> Float[Array, "r r"]:
         """How much detail is let in at each texel, 0 to 1."""
@@ -272,12 +234,13 @@ class _Work:
 
     def start(self, level: int, nearest: int) -> Float[np.ndarray, "r r 3"]:
         """The texture before synthesis: whole, sRGB-encoded."""
-        low = texture = self.maps(level).low_frequency
-        if self.settings.start == "neighbour":
-            texture = low + self.detail(level)[..., None] * (self.subject(nearest, level) - low)
-        texture = self.with_photo(texture, level)
-        skin = block_means(self.seen.skin[..., None].astype(np.float32), level)
-        return np.asarray(skin * texture + (1 - skin) * low)
+        neighbour = self.options.start == "neighbour"
+        subject = self.subject(nearest, level) if neighbour else None
+        # The paper starts from the low-frequency albedo alone; what is kept of the photo is shown.
+        kept = neighbour or self.options.keep_photo > 0
+        return start_texture(
+            self.maps(level), subject, self.detail(level), self._mean("skin", level), kept
+        )
 
     def synthesise(
         self,
@@ -289,25 +252,19 @@ class _Work:
         index: int,
     ) -> Level:
         """Section 5 at one level, from the coarser level's result with the start's finer detail."""
-        first = self.cut(rgb_to_yiq(jnp.asarray(start))[..., 0], level)
-        if coarser.size:
-            lower = resize(first[..., None], *coarser.shape)
-            first = first + resize(jnp.asarray(coarser)[..., None] - lower, *first.shape)[..., 0]
+        box = self.box(level)
+        first = first_intensity(start[box], coarser)
         seen = self.maps(level)
-        free = self.cut(seen.mask, level)
-        known = KnownDetail(
-            self.cut(rgb_to_yiq(seen.photo)[..., 0], level),
-            self.cut(seen.weight, level) * free,
-            self.cut(rgb_to_yiq(seen.low_frequency)[..., 0], level),
-            self.cut(self.detail(level), level),
-        )
         goal = self.targets(level, blended, used)
-        targets = StyleTargets(goal, alpha=self.settings.alpha)
-        blur = jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype)
         problem = SynthesisProblem(
-            self.network, targets, jnp.asarray(free), known, blur, self.settings.weights
+            self.network,
+            StyleTargets(goal, alpha=self.options.alpha),
+            jnp.asarray(seen.mask[box]),
+            known_detail(seen, self.detail(level), box),
+            jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype),
+            SynthesisWeights(self.options.keep_photo, self.options.keep_plain),
         )
-        steps = level_steps(self.settings.iterations, len(self.levels))[index]
+        steps = level_steps(self.options.iterations, len(self.levels))[index]
         what = f"synthesis at {level}"
 
         def on_step(step: int, value: float, image: Callable[[], Array]) -> None:
@@ -315,12 +272,9 @@ class _Work:
 
         hand_back_freed_memory()
         found = synthesise(
-            jnp.clip(first, 0.01, 0.99),
-            problem,
-            steps=steps,
-            tile=self.tile(level),
-            on_step=on_step,
-        )
+            jnp.clip(first, 0.01, 0.99), problem,
+            steps=steps, tile=box_tile(*first.shape), on_step=on_step,
+        )  # fmt: skip
         record = {
             "name": f"{level} px",
             "values": found.values,
@@ -336,13 +290,7 @@ class _Work:
     ) -> Float[np.ndarray, "r r 3"]:
         """The synthesised intensity with the start's colour, in the start's surroundings."""
         level = len(start)
-        box = self.box(level)
-        colour = jnp.asarray(start[box])
-        first = rgb_to_yiq(colour)[..., 0]
-        change = jnp.asarray(intensity) - first
-        mixed = first + faded(change, self.cut(self.maps(level).mask, level), level)
-        whole = np.array(start)
-        whole[box] = np.asarray(with_intensity(colour, mixed))
-        inside = block_means(self.seen.inside[..., None].astype(np.float32), level)
-        # Between the charts the nearest colours continue, so that a filter finds no dark rim.
-        return np.asarray(push_pull(jnp.asarray(whole), jnp.asarray(inside[..., 0] > 0.99, float)))
+        return composed(
+            start, intensity, self.box(level), self.maps(level).mask,
+            self._mean("inside", level), self.options.fade,
+        )  # fmt: skip

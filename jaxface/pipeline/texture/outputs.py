@@ -10,14 +10,14 @@ import numpy as np
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.imaging.resample import block_means
 from jaxface.io.atomic import atomic_path
-from jaxface.io.fit_file import read_fit
 from jaxface.io.formats.exr import write_exr
 from jaxface.io.formats.image import write_png
 from jaxface.io.formats.retexture import retexture_glb, retexture_obj
 from jaxface.io.pictures.overlay import contact_sheet
 from jaxface.io.pictures.report import write_report
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.pipeline.texture._complete import Completed
+from jaxface.models.parameters import FaceParameters
+from jaxface.pipeline.texture.records import Completed
 from jaxface.pipeline.texture.seen import SeenTexture
 from jaxface.pipeline.texture.views import face_views
 from jaxface.run.environment import environment
@@ -36,6 +36,7 @@ def save_completed(
     place: Path,
     done: Completed,
     seen: SeenTexture,
+    parameters: FaceParameters,
     textures: TextureDatabase,
     network_licence: str,
     seconds: float,
@@ -46,6 +47,7 @@ def save_completed(
         place: folder of the fit; its meshes get the new texture.
         done: the completion.
         seen: what it started from.
+        parameters: of the fit.
         textures: the database.
         network_licence: of the feature network.
         seconds: how long it took.
@@ -67,6 +69,7 @@ def save_completed(
         "schema": 1,
         "database": textures.name,
         "compared_at": done.analysed_at,
+        "compared_by": done.compared_by,
         "weights": weights,
         "objective": float(blended.objective),
         "lower_bound": float(blended.lower_bound),
@@ -77,7 +80,7 @@ def save_completed(
     with atomic_path(place / "blend.json") as temporary:
         temporary.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     write_png(place / "completion.png", _sheet(done, seen, textures, order))
-    views = face_views(seen.model, read_fit(place / "fit.npz").parameters, linear)
+    views = face_views(seen.model, parameters, linear)
     write_png(place / "face.png", contact_sheet(views, columns=2, heading="complete face"))
     if (place / "mesh.glb").is_file():
         retexture_glb(place / "mesh.glb", (place / "albedo.png").read_bytes())
@@ -90,10 +93,10 @@ def _sheet(
     done: Completed, seen: SeenTexture, textures: TextureDatabase, order: list[int]
 ) -> np.ndarray:
     box = done.box
-    partial = np.where(seen.weight[..., None] > 0, seen.photo, 0.5)
+    partial = np.where(seen.weight[..., None] > 0, seen["photo"], 0.5)
     panels = [
         ("partial albedo", partial[box]),
-        ("low frequencies", seen.low_frequency[box]),
+        ("low frequencies", seen["low_frequency"][box]),
         ("before synthesis", done.start[box]),
         ("complete albedo", done.albedo[box]),
     ]
@@ -116,11 +119,11 @@ def _sheet(
 def _close_ups(seen: SeenTexture) -> dict[str, tuple[int, int]]:
     """Row and column in the middle of some regions of the synthesised part."""
     names = seen.model.region_names
-    region = np.asarray(seen.model.region)[seen.vertex_of]
+    region = np.asarray(seen.model.region)[seen["vertex"]]
     found = {}
     for name in ("forehead", "nose", "cheeks", "lips"):
         if name in names:
-            rows, columns = np.nonzero(seen.free & (region == names.index(name)))
+            rows, columns = np.nonzero(seen["free"] & (region == names.index(name)))
             if len(rows):
                 # Of two cheeks the one on the left of the map.
                 left = columns <= np.median(columns) if name == "cheeks" else columns >= 0
