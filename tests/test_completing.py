@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from jaxface.energies import grams
 from jaxface.geometry.uv import uv_layout
-from jaxface.imaging.colour import srgb_to_linear
+from jaxface.imaging.colour import rgb_to_yiq, srgb_to_linear
 from jaxface.imaging.resample import block_means
 from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.skin.regions import skin_fields
 from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.pipeline.databases.grams import precompute
 from jaxface.pipeline.texture._complete import complete
 from jaxface.pipeline.texture.folder import _Levels, open_database
 from jaxface.pipeline.texture.options import CompletionOptions
@@ -266,3 +268,46 @@ def test_blotches_fade_slowly_at_the_outline_pores_soon_and_the_complexion_stays
     assert kept(pores, inside) > 0.98 and kept(pores, beside_outline) > 0.9
     complexion = np.cos(2 * np.pi * (x - 90) / 400)
     assert abs(kept(complexion, inside & (radius < 50))) < 0.1
+
+
+def test_as_published_is_the_paper(model, base, database, network):
+    """Section 5 at one resolution over the whole map, from the model's albedo as it is."""
+    weight = np.zeros((SIZE, SIZE), np.float32)
+    weight[:, : SIZE // 2] = 1
+    coefficients = np.full(model.albedo.count, 0.5, np.float32)
+    partial = speckled(base, 0.15, 9)
+    shown = seen_texture(
+        model, partial, weight, coefficients, 1.0, plausible=False, whole=True
+    )  # fmt: skip
+    layout = uv_layout(model.uv, model.uv_faces, SIZE)
+    inside = np.asarray(layout.inside)
+    low = np.asarray(layout(model.reflectance(jnp.asarray(coefficients)), model.faces))
+    np.testing.assert_allclose(
+        srgb_to_linear(shown["low_frequency"])[inside], low[inside], atol=1e-4
+    )
+    np.testing.assert_allclose(srgb_to_linear(shown["photo"]), partial, atol=1e-4)
+    np.testing.assert_array_equal(shown.weight, weight)
+    assert shown["free"].all()
+
+    options = dataclasses.replace(CompletionOptions.as_published(), iterations=8, layers=LAYERS)
+    done = complete(shown, database, network, options)
+    assert done.compared_by == "network" and done.analysed_at == SIZE
+    assert done.box == (slice(0, SIZE), slice(0, SIZE)) and len(done.levels) == 1
+    np.testing.assert_allclose(done.start, shown["low_frequency"], atol=1e-5)
+    # The target is the convex blend of the subjects' own Gram matrices, eq. 2.
+    own = [grams(network, rgb_to_yiq(jnp.asarray(texture))[..., 0], LAYERS) for texture in database]
+    for name in LAYERS:
+        blended = sum(w * g[name] for w, g in zip(done.blended.weights, own, strict=True))
+        np.testing.assert_allclose(done.targets[name], blended, rtol=2e-3, atol=1e-5)
+    # I and Q stay those of the low-frequency albedo.
+    found, first = (np.asarray(rgb_to_yiq(jnp.asarray(x))) for x in (done.albedo, done.start))
+    unclipped = inside & (done.albedo > 0.01).all(-1) & (done.albedo < 0.99).all(-1)
+    assert unclipped.mean() > 0.2
+    np.testing.assert_allclose(found[unclipped][:, 1:], first[unclipped][:, 1:], atol=2e-3)
+    values = done.levels[0]["values"]
+    assert values[-1] < 0.5 * values[0]
+
+    precompute(database, network, SIZE, layers=LAYERS)
+    again = complete(shown, database, network, dataclasses.replace(options, iterations=1))
+    assert again.compared_by == "cache"
+    np.testing.assert_allclose(again.blended.weights, done.blended.weights, atol=2e-3)
