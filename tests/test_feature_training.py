@@ -186,13 +186,14 @@ def test_files_of_a_run_and_resuming_from_disk(tmp_path, folder, monkeypatch) ->
     out = tmp_path / "stopped.npz"
     with pytest.raises(StoppedError):
         train_features(folder, out, on_step=stop, **settings)
-    assert out.with_suffix(".part.npz").is_file()
+    part = out.with_suffix(".part") / "state.npz"
+    assert part.is_file()
     assert not out.exists()
     seen = []
     resumed = train_features(folder, out, on_step=lambda *step: seen.append(step), **settings)
     assert seen == [("steps", 5, 6), ("steps", 6, 6)]
     assert_same(whole, resumed)
-    assert not out.with_suffix(".part.npz").exists()
+    assert not part.parent.exists()
     report = json.loads(out.with_suffix(".json").read_text())
     assert len(report["losses"]) == 6
     assert 0 <= report["identified"] <= 1
@@ -202,11 +203,50 @@ def test_files_of_a_run_and_resuming_from_disk(tmp_path, folder, monkeypatch) ->
         np.testing.assert_allclose(read.kernels[name], whole.kernels[name], rtol=1e-3, atol=1e-6)
 
 
+def test_a_kept_state_of_other_inputs_or_a_damaged_one_starts_anew(
+    tmp_path, folder, monkeypatch
+) -> None:
+    def count(pictures, steps, seed, batch, shape, state):
+        """In place of training, which other tests do."""
+        while state.step < steps:
+            state = state._replace(step=state.step + 1, losses=(*state.losses, 0.5))
+            yield state
+
+    monkeypatch.setattr(feature_training, "CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr(feature_training, "train", count)
+    monkeypatch.setattr(feature_training, "identification", lambda network, pictures: 0.0)
+    settings = {"steps": 3, "skins": 0, "batch": 2, "shape": TINY}
+
+    class StoppedError(Exception):
+        pass
+
+    def first_step(until, **changed) -> int:
+        seen = []
+
+        def stop(what, done, of) -> None:
+            seen.append(done)
+            if len(seen) == until:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            train_features(folder, tmp_path / "a.npz", on_step=stop, **settings | changed)
+        return seen[0]
+
+    assert first_step(2) == 1  # step 1 is kept
+    assert first_step(1) == 2
+    assert first_step(1, seed=1) == 1
+    assert first_step(1, batch=3) == 1
+    assert first_step(1) == 2, "a call that has kept nothing leaves what was kept"
+    (tmp_path / "a.part" / "state.npz").write_bytes(b"cut off")
+    with pytest.warns(UserWarning, match="state.npz is no whole checkpoint"):
+        assert first_step(1) == 1
+
+
 def test_bad_files(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"ends in \.npz"):
         train_features(None, tmp_path / "weights.txt")
     with pytest.raises(FileNotFoundError, match="no folder"):
-        train_features(tmp_path / "absent", tmp_path / "weights.npz")
+        train_features(tmp_path / "absent", tmp_path / "weights.npz", shape=TINY)
     with pytest.raises(ValueError, match="no pictures"):
         folder_pictures(tmp_path)
 

@@ -1,27 +1,26 @@
 """Train a feature network on pictures that are at hand, and write its weights with a report."""
 
-import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Float
+from jaxface._types import Array, Float
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.atomic import atomic_path
 from jaxface.io.cache_folder import cache_dir
+from jaxface.io.checkpoint import Checkpoint
+from jaxface.io.digest import digest
 from jaxface.io.feature_weights import save_network
 from jaxface.io.formats.image import read_image
-from jaxface.io.formats.restricted_pickle import load_npz
 from jaxface.io.pictures.chart import convergence_svg
 from jaxface.networks.texture_features.network import FeatureNetwork
 from jaxface.pipeline.databases.painted import synth_database
+from jaxface.run.kept_programs import source_digest
 from jaxface.training.features import (
     CROP,
     TrainingState,
@@ -48,6 +47,7 @@ LICENCE = "CC0-1.0: trained by jaxface on CC0 and public-domain pictures and pro
 OWN_LICENCE = "trained by jaxface on the user's own pictures"
 
 CHECKPOINT_EVERY = 50
+_STATE = "state"
 _STYLE = "text{font:12px sans-serif;fill:#555}.grid{stroke:#ddd}.series-0{stroke:#2a6f97;fill:none}"
 
 
@@ -65,8 +65,8 @@ def train_features(
     """Train, equalise the layers, and write the network where ``load_network`` reads it.
 
     Beside ``out`` come ``.json`` (loss at each step; how often a texture's other half is found
-    among 64, before and after) and ``.svg`` (the loss). While it runs there is a ``.part.npz``,
-    from which a call with the same pictures and settings goes on.
+    among 64, before and after) and ``.svg`` (the loss). While it runs there is a folder
+    ``.part``, from which a call with the same pictures, settings and code goes on.
 
     Args:
         images: folder of pictures, each at least 256 px high and 128 px wide; by default those
@@ -92,12 +92,14 @@ def train_features(
     pictures = [level for picture in pictures for level in _octaves(picture)]
     check_pictures(pictures)
     initial = identification(state.learner.network, pictures)
-    checkpoint = _Checkpoint(out, state, _fingerprint(pictures, (steps, seed, batch, str(shape))))
-    state = start = checkpoint.read()
+    settings = repr((steps, seed, batch, shape))
+    key = digest(source_digest(), settings, repr([*_arrays(state)]), *pictures)
+    checkpoint = Checkpoint(out.with_suffix(".part"), key)
+    state = start = _resumed(checkpoint, state)
     for state in train(pictures, steps, seed, batch, shape, start):
         on_step("steps", state.step, steps)
         if state.step % CHECKPOINT_EVERY == 0:
-            checkpoint.write(state)
+            _keep(checkpoint, state)
     found = equalised(state.learner.network)
     network = FeatureNetwork(
         found.kernels, found.biases, found.pooling, "trained",
@@ -105,7 +107,7 @@ def train_features(
     )  # fmt: skip
     save_network(out, network, half=True)
     _report(out, state, seed, len(pictures), initial, identification(network, pictures))
-    checkpoint.path.unlink(missing_ok=True)
+    checkpoint.clear()
     return network
 
 
@@ -166,41 +168,26 @@ def _octaves(picture: Float[np.ndarray, "h w"]) -> list[Float[np.ndarray, "h w"]
     return levels
 
 
-def _fingerprint(pictures: Sequence[np.ndarray], settings: tuple[Any, ...]) -> str:
-    digest = hashlib.sha256(repr(settings).encode())
-    for picture in pictures:
-        digest.update(np.ascontiguousarray(picture).tobytes())
-    return digest.hexdigest()
+def _arrays(state: TrainingState) -> dict[str, Array]:
+    """Weights, temperatures and the optimiser's memory, each by its place in the state."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path((state.learner, state.optimiser))
+    return {jax.tree_util.keystr(place): leaf for place, leaf in leaves}
 
 
-class _Checkpoint:
-    """A run's state on disk; a file of other pictures or settings is left unread, then replaced."""
+def _keep(checkpoint: Checkpoint, state: TrainingState) -> None:
+    arrays = {name: np.asarray(x) for name, x in _arrays(state).items()}
+    checkpoint.write(_STATE, arrays, {"step": state.step, "losses": state.losses})
 
-    def __init__(self, out: Path, start: TrainingState, fingerprint: str) -> None:
-        self.path = out.with_suffix(".part.npz")
-        self._start = start
-        self._fingerprint = fingerprint
 
-    def read(self) -> TrainingState:
-        if not self.path.is_file():
-            return self._start
-        arrays = load_npz(self.path)
-        if str(arrays["fingerprint"]) != self._fingerprint:
-            return self._start
-        like = (self._start.learner, self._start.optimiser)
-        leaves, structure = jax.tree.flatten(like)
-        read = [jnp.asarray(arrays[f"leaf{i}"], x.dtype) for i, x in enumerate(leaves)]
-        learner, memory = jax.tree.unflatten(structure, read)
-        losses = tuple(float(loss) for loss in arrays["losses"])
-        return TrainingState(int(arrays["step"]), learner, memory, losses)
-
-    def write(self, state: TrainingState) -> None:
-        leaves = jax.tree.leaves(eqx.filter((state.learner, state.optimiser), eqx.is_array))
-        arrays: dict[str, Any] = {f"leaf{i}": np.asarray(x) for i, x in enumerate(leaves)}
-        with atomic_path(self.path) as temporary, open(temporary, "wb") as file:
-            np.savez(
-                file, step=state.step, losses=state.losses, fingerprint=self._fingerprint, **arrays
-            )
+def _resumed(checkpoint: Checkpoint, start: TrainingState) -> TrainingState:
+    """The state kept last, or the start."""
+    kept = checkpoint.read(_STATE)
+    if kept is None:
+        return start
+    structure = jax.tree.structure((start.learner, start.optimiser))
+    leaves = [jnp.asarray(kept.arrays[name], x.dtype) for name, x in _arrays(start).items()]
+    learner, memory = jax.tree.unflatten(structure, leaves)
+    return TrainingState(kept.record["step"], learner, memory, tuple(kept.record["losses"]))
 
 
 def _report(
