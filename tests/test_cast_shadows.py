@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,6 +65,9 @@ def true_shading(points: np.ndarray) -> np.ndarray:
     return AMBIENT + KEY * LAMP[2] * ~hidden
 
 
+cast_program = jax.jit(cast_shadows)
+
+
 @pytest.fixture(scope="module")
 def photo():
     model = scene()
@@ -87,7 +91,7 @@ def photo():
         jnp.asarray(image, jnp.float32), jnp.ones((SIZE, SIZE)), jnp.zeros((12, 2)), jnp.ones(12),
         jnp.asarray(0.3), principal, y.log_focal, jnp.asarray(0.1), jnp.asarray(False),
     )  # fmt: skip
-    found, *cast = jax.jit(cast_shadows)(y, data.image, data.mask, data, prepared, model)
+    found, *cast = cast_program(y, data.image, data.mask, data, prepared, model)
     return model, y, prepared, data, found, cast, fragments
 
 
@@ -166,12 +170,30 @@ def test_pixels_in_shadow_are_trusted_less(photo):
     np.testing.assert_array_equal(shadow_trust(found, bare, samples), 1.0)
 
 
-def test_no_gradient_passes_and_nothing_is_nan_in_the_dark(photo):
+def test_no_gradient_passes(photo):
+    """Neither from the fit so far, nor from the photo, nor from the model."""
+    model, y, prepared, data, *_ = photo
+
+    def total(y, image, data, prepared):
+        found = cast_shadows(
+            y, image, data.mask, data, prepared, model, directions=32, pixels=200, rounds=2
+        )
+        return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(found))
+
+    given = (y, data.image, data, prepared)
+    slope = eqx.filter_jit(eqx.filter_grad(lambda given: total(*given)))(given)
+    leaves = jax.tree.leaves(slope)
+    assert len(leaves) > 15
+    for leaf in leaves:
+        np.testing.assert_array_equal(leaf, 0.0)
+
+
+def test_nothing_is_nan_in_the_dark(photo):
     model, y, prepared, data, *_ = photo
     black = jnp.zeros_like(data.image)
-    dark = cast_shadows(y, black, data.mask, data, prepared, model, directions=32)
+    dark = cast_program(y, black, data.mask, data, prepared, model)
     assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(dark))
-    nothing = cast_shadows(y, data.image, 0 * data.mask, data, prepared, model, directions=32)
+    nothing = cast_program(y, data.image, 0 * data.mask, data, prepared, model)
     assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(nothing))
 
 

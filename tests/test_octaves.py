@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from jaxface.stages.texture.octaves import octave_bands, with_photos_octaves
 
@@ -17,9 +18,20 @@ def grain(strength: float, seed: int) -> jnp.ndarray:
 def test_bands_sum_to_what_the_last_blur_takes_away():
     image = grain(0.1, 0)[..., 0]
     bands = np.asarray(octave_bands(image))
-    wave = jnp.asarray(np.sin(2 * np.pi * np.arange(SIDE) / 12)[None].repeat(SIDE, 0), jnp.float32)
-    strength = np.asarray(octave_bands(wave))[:, 40:80, 40:80].std(axis=(1, 2))
-    assert bands.shape[0] == 4 and strength.argmax() == 2
+    assert bands.shape == (4, SIDE, SIDE)
+    away = np.asarray(image, float) - float(image.mean())
+    expected = away - gaussian_filter(away, 0.26 * 4 * 2**3, mode="constant", truncate=6)
+    # The spectrum's period is 16 texels longer than the image: its rims know of each other.
+    inner = slice(24, -24), slice(24, -24)
+    np.testing.assert_allclose(bands.sum(axis=0)[inner], expected[inner], atol=1e-5)
+    assert np.abs(expected[inner]).max() > 0.2
+
+
+@pytest.mark.parametrize(("band", "wavelength"), [(0, 3), (1, 6), (2, 12), (3, 24)])
+def test_a_wave_is_strongest_in_the_band_of_its_octave(band, wavelength):
+    wave = np.sin(2 * np.pi * np.arange(SIDE) / wavelength)[None].repeat(SIDE, 0)
+    bands = np.asarray(octave_bands(jnp.asarray(wave, jnp.float32)))
+    assert bands[:, 40:88, 40:88].std(axis=(1, 2)).argmax() == band
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.6])

@@ -1,12 +1,16 @@
 """Traced programs on disk: used again, traced anew where they must be, never in the way."""
 
+import contextlib
+
 import equinox as eqx
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxface._types import Array, Float
+from jaxface.run import kept_programs
 from jaxface.run.kept_programs import keep_structure, kept_program
 
 
@@ -81,13 +85,30 @@ def test_a_damaged_file_is_traced_anew_and_replaced(folder, traced, damage):
     assert not traced[1]
 
 
-def test_without_a_cache_nothing_is_written(tmp_path, traced, monkeypatch):
-    before = jax.config.values["jax_compilation_cache_dir"]
+def test_without_a_cache_nothing_is_written_or_looked_for(folder, traced, monkeypatch):
+    def refused(*args, **given):
+        raise AssertionError("a file is touched")
+
+    # Where a program would be kept, if no folder were a name like any other.
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(kept_programs, "atomic_path", refused)
+    monkeypatch.setattr(kept_programs, "Path", refused)
+    monkeypatch.setattr(jax.export, "export", refused)
     jax.config.update("jax_compilation_cache_dir", None)
-    try:
-        np.testing.assert_array_equal(call(traced[0]).first, 2.0)
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
+    np.testing.assert_array_equal(call(traced[0]).first, 2.0)
+    assert len(traced[1]) == 1
+    assert not list(folder.rglob("*traced-*"))
+
+
+def test_a_folder_that_cannot_be_written_costs_nothing_but_time(folder, traced, monkeypatch):
+    @contextlib.contextmanager
+    def full(path):
+        raise OSError("disk full")
+        yield
+
+    monkeypatch.setattr(kept_programs, "atomic_path", full)
+    np.testing.assert_array_equal(call(traced[0]).first, 2.0)
+    assert not list(folder.glob("traced-*"))
 
 
 def test_a_function_of_the_callers_among_the_settings_is_never_kept(folder, traced):

@@ -146,7 +146,7 @@ def cast_shadows(
     back = jnp.linalg.solve(square, turned_light.T)
     transfer = soft + (loss - soft @ turned_light) @ back
     y = eqx.tree_at(lambda p: p.light, y, light)
-    return y, *jax.lax.stop_gradient((transfer, turning @ back))
+    return jax.lax.stop_gradient((y, transfer, turning @ back))
 
 
 def shadow_trust(
