@@ -6,17 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Float, Int, Shaped
+from jaxface._types import Array, Bool, Float, Int, PyTree, Shaped
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def safe_norm(
-    x: Float[Array, "*batch d"], axis: int = -1, keepdims: bool = False
-) -> Float[Array, "*batch"]:
+    x: Float[Array, "*shape"], axis: int = -1, keepdims: bool = False
+) -> Float[Array, "*reduced"]:
     """Euclidean norm whose derivatives at the origin are zero instead of NaN.
 
     The input is scaled by its largest entry, so neither squares of tiny values underflow nor
     squares of huge ones overflow.
+
+    Args:
+        x: values.
+        axis: the one along which the norm is taken.
+        keepdims: True leaves that axis with length 1, False takes it away.
     """
     scale = jnp.max(jnp.abs(x), axis=axis, keepdims=True)
     scaled = x / jnp.where(scale == 0, 1.0, scale)
@@ -35,16 +40,19 @@ def _safe_norm_jvp(
     return (norm, change) if keepdims else (jnp.squeeze(norm, axis), jnp.squeeze(change, axis))
 
 
-def safe_normalize(x: Float[Array, "*batch d"], axis: int = -1) -> Float[Array, "*batch d"]:
+def safe_normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
     """``x / |x|``; the zero vector maps to zero with a zero derivative."""
     norm = safe_norm(x, axis=axis, keepdims=True)
     return x / jnp.where(norm == 0, 1.0, norm) * (norm > 0)
 
 
 def safe_divide(
-    numerator: Float[Array, "*batch"], denominator: Float[Array, "*batch"], fill: float = 0.0
-) -> Float[Array, "*batch"]:
-    """``numerator / denominator``, and ``fill`` (derivative zero) where the denominator is 0."""
+    numerator: Float[Array, "*#batch"], denominator: Float[Array, "*#batch"], fill: float = 0.0
+) -> Float[Array, "*#batch"]:
+    """``numerator / denominator``, and ``fill`` (derivative zero) where the denominator is 0.
+
+    The shapes may differ, as long as they broadcast.
+    """
     zero = denominator == 0
     return jnp.where(zero, fill, numerator / jnp.where(zero, 1.0, denominator))
 
@@ -71,6 +79,29 @@ def safe_sqrt(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def safe_arctan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Angle (radians) of the point (x, y); at the origin it is zero with a zero derivative."""
+    origin = (x == 0) & (y == 0)
+    return jnp.arctan2(jnp.where(origin, 0.0, y), jnp.where(origin, 1.0, x))
+
+
+def above_rounding(
+    total: Float[Array, "*batch d"], size: Float[Array, "*batch"]
+) -> Float[Array, "*batch d"]:
+    """``total``, or zero (with a zero derivative) where no more than rounding is left of it.
+
+    What cancels in exact arithmetic leaves a last digit behind whose direction depends on the
+    order of the sum, which the two modes of differentiation need not share.
+
+    Args:
+        total: sums, vectors along the last axis.
+        size: sum of the magnitudes of the products that went into each.
+    """
+    limit = 16 * jnp.finfo(total.dtype).eps * jax.lax.stop_gradient(size)
+    nothing = jnp.max(jnp.abs(total), axis=-1) <= limit
+    return jnp.where(nothing[..., None], 0.0, total)
+
+
 def running_count(flags: Shaped[Array, "*batch t"]) -> Int[Array, "*batch t"]:
     """How many flags (zeros and ones) are set up to and with each, along the last axis.
 
@@ -93,9 +124,9 @@ def running_count(flags: Shaped[Array, "*batch t"]) -> Int[Array, "*batch t"]:
     return summed(flags.astype(jnp.float32)).astype(jnp.int32)
 
 
-def all_finite(tree: Shaped[Array, "..."]) -> Array:
-    """True where every floating-point leaf of a pytree is finite."""
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """True where every floating-point leaf of a pytree is finite, and where there is none."""
     leaves = [
         x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)
     ]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool))

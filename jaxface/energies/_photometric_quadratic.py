@@ -20,7 +20,7 @@ Jacobian carries the whole mesh through each of some 250 columns.
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import cross
+from jaxface._numerics import cross, safe_norm, safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies.photometric import (
     PhotometricData,
@@ -96,7 +96,7 @@ def photometric_jacobian(
     x = jnp.einsum("pi,pij->pj", b, points)
     m = jnp.einsum("pi,pij->pj", b, normals)
     a = jnp.einsum("pi,pij->pj", b, albedos)
-    m_norm = jnp.maximum(jnp.sqrt(jnp.sum(m * m, axis=-1, keepdims=True)), 1e-12)
+    m_norm = jnp.maximum(safe_norm(m, keepdims=True), 1e-12)
     n = m / m_norm
     shading = irradiance(n, y.light)
     hidden, occlusion = None, None
@@ -180,11 +180,11 @@ def photometric_quadratic(
     used = sampled.weight[:, None] > 0
     difference = jnp.where(used, sampled.color - synth, 0.0)
     weight = reweighting(difference, sampled.weight)
-    scaled = (jnp.sqrt(weight)[:, None, None] * jacobian).reshape(-1, jacobian.shape[-1])
+    scaled = (safe_sqrt(weight)[:, None, None] * jacobian).reshape(-1, jacobian.shape[-1])
     scaled = jnp.where(jnp.repeat(used, 3, axis=0), scaled, 0.0)
     curvature = scaled.T @ scaled
     if curvature_samples is None:
-        root = (jnp.sqrt(weight)[:, None] * difference).reshape(-1)
+        root = (safe_sqrt(weight)[:, None] * difference).reshape(-1)
         value = photometric_energy(y, data)
         return Quadratic(value, -2 * (root @ scaled), curvature)
     value, gradient = jax.value_and_grad(photometric_energy)(y, data)

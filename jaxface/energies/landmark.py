@@ -8,6 +8,7 @@ term means the same at every resolution and pyramid level.
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import MorphableModel, SurfacePoints
@@ -47,6 +48,10 @@ def landmark_difference(y: FaceParameters, data: LandmarkData) -> Float[Array, "
 
 
 def landmark_residual(y: FaceParameters, data: LandmarkData) -> Float[Array, "l 2"]:
-    """Residual with ``||r||^2 = E_lan``, the weighted mean of squared distances in ``unit``."""
+    """Residual with ``||r||^2 = E_lan``, the weighted mean of squared distances in ``unit``.
+
+    A landmark of weight 0 takes no part: its row is zero, and so is the row's derivative in the
+    weight (that of a square root, which does not exist there).
+    """
     share = data.weight / jnp.maximum(jnp.sum(data.weight), 1e-6)
-    return jnp.sqrt(share)[:, None] * landmark_difference(y, data) / data.unit
+    return safe_sqrt(share)[:, None] * landmark_difference(y, data) / data.unit

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import safe_norm, safe_sqrt
 from jaxface._types import Array, Float, Int
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.ray import pixel_rays, ray_weights
@@ -101,7 +101,8 @@ def photometric_residual(y: FaceParameters, data: PhotometricData) -> Float[Arra
     """Residual whose squared norm is the IRLS majoriser of ``E_c`` at ``y``.
 
     ``||r||^2 = E_c / 2`` and ``grad ||r||^2 = grad E_c`` where no pixel is under the floor of
-    ``reweighting``, whose weights are constants (``stop_gradient``).
+    ``reweighting``, whose weights are constants (``stop_gradient``). A sample of weight 0 has a
+    zero row, with a zero derivative in the weight too (where that of a square root does not exist).
     """
     difference = photometric_difference(y, data)
-    return jnp.sqrt(reweighting(difference, data.samples.weight))[:, None] * difference
+    return safe_sqrt(reweighting(difference, data.samples.weight))[:, None] * difference

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool as NpBool
 from jaxtyping import Int as NpInt
 
-from jaxface._numerics import cross, safe_normalize
+from jaxface._numerics import above_rounding, cross, safe_normalize
 from jaxface._types import Array, Float, Int
 
 
@@ -23,8 +23,21 @@ def face_areas_normals(
 
 
 def face_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "f 3"]:
-    """Unit normals of the triangles; zero, with a zero derivative, where the area is zero."""
-    return safe_normalize(face_areas_normals(vertices, faces))
+    """Unit normals of the triangles; zero, with a zero derivative, where the area is zero.
+
+    An area counts as zero if it is within the rounding of the products it is made from.
+    """
+    weighted, size = _weighted_normals(vertices, faces)
+    return safe_normalize(above_rounding(weighted, size))
+
+
+def _weighted_normals(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]
+) -> tuple[Float[Array, "f 3"], Float[Array, "f"]]:
+    """Area-weighted normals, and the size of the products that each is a difference of."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    size = jnp.max(jnp.abs(b - a), axis=-1) * jnp.max(jnp.abs(c - a), axis=-1)
+    return cross(b - a, c - a), jax.lax.stop_gradient(size)
 
 
 def vertex_normals(
@@ -41,17 +54,19 @@ def vertex_normals(
             parallel, rather than a scatter.
 
     Returns:
-        Zero, with a zero derivative, at vertices without a triangle of positive area.
+        Zero, with a zero derivative, at vertices without a triangle of positive area, and where
+        triangles that face opposite ways cancel to within rounding.
     """
-    weighted = face_areas_normals(vertices, faces)
-    if incident is None:
-        sums = jax.ops.segment_sum(
-            jnp.repeat(weighted, 3, axis=0), jnp.reshape(faces, -1), vertices.shape[0]
-        )
-    else:
-        present = (incident >= 0)[..., None]
-        sums = jnp.sum(jnp.where(present, weighted[jnp.maximum(incident, 0)], 0.0), axis=1)
-    return safe_normalize(sums)
+    weighted, size = _weighted_normals(vertices, faces)
+
+    def around(values: Array) -> Array:
+        if incident is None:
+            each, owner = jnp.repeat(values, 3, axis=0), jnp.reshape(faces, -1)
+            return jax.ops.segment_sum(each, owner, vertices.shape[0])
+        present = (incident >= 0).reshape(*incident.shape, *[1] * (values.ndim - 1))
+        return jnp.sum(jnp.where(present, values[jnp.maximum(incident, 0)], 0.0), axis=1)
+
+    return safe_normalize(above_rounding(around(weighted), around(size)))
 
 
 def edges(faces: NpInt[np.ndarray, "f 3"]) -> NpInt[np.ndarray, "e 2"]:

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._numerics import cross
+from jaxface._numerics import above_rounding, cross, safe_divide, safe_norm
 from jaxface._types import Array, Float, Int
 
 
@@ -80,9 +80,11 @@ def normal_derivative(
 
     Returns:
         The area-weighted unit normals, and ``(I - n n^T) / |N| dN`` for each mode. A vertex
-        without area has a zero normal and a zero derivative.
+        without area, or whose faces cancel to within rounding, has a zero normal and a zero
+        derivative (as in ``mesh.vertex_normals``).
     """
     area_normal = jnp.zeros_like(vertices)
+    size = jnp.zeros_like(vertices[:, 0])
     own = jnp.zeros_like(vertices)
     change = jnp.zeros_like(basis)
 
@@ -95,22 +97,29 @@ def normal_derivative(
         own = own - arm
         # Each face is met by two of the vertex's edges, and sum_j (v_j - v_i) x c_ij counts it
         # twice: it is the derivative of a quadratic form along itself.
-        area_normal = area_normal + 0.5 * cross(vertices[neighbor] - vertices, arm)
+        away = vertices[neighbor] - vertices
+        area_normal = area_normal + 0.5 * cross(away, arm)
+        size = size + 0.5 * _largest(away) * _largest(arm)
         change = change + _cross_modes(basis[neighbor], arm)
     if stencil.extra.shape[0]:
         vertex, neighbor, ahead, behind = stencil.extra.T
         arm = vertices[ahead] - vertices[behind]
         own = own.at[vertex].add(-arm)
-        area_normal = area_normal.at[vertex].add(
-            0.5 * cross(vertices[neighbor] - vertices[vertex], arm)
-        )
+        away = vertices[neighbor] - vertices[vertex]
+        area_normal = area_normal.at[vertex].add(0.5 * cross(away, arm))
+        size = size.at[vertex].add(0.5 * _largest(away) * _largest(arm))
         change = change.at[vertex].add(_cross_modes(basis[neighbor], arm))
     change = change + _cross_modes(basis, own)
-    length = jnp.sqrt(jnp.sum(area_normal**2, axis=-1, keepdims=True))
-    inverse = jnp.where(length > 0, 1.0 / jnp.where(length > 0, length, 1.0), 0.0)
+    area_normal = above_rounding(area_normal, size)
+    length = safe_norm(area_normal, keepdims=True)
+    inverse = safe_divide(jnp.ones_like(length), length)
     unit = area_normal * inverse
     along = jnp.sum(unit[..., None] * change, axis=1, keepdims=True)
     return unit, (change - unit[..., None] * along) * inverse[..., None]
+
+
+def _largest(vectors: Float[Array, "n 3"]) -> Float[Array, "n"]:
+    return jnp.max(jnp.abs(vectors), axis=-1)
 
 
 def _cross_modes(moved: Float[Array, "n 3 k"], arm: Float[Array, "n 3"]) -> Float[Array, "n 3 k"]:

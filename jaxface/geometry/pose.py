@@ -1,8 +1,10 @@
 """Head pose from landmarks in closed form."""
 
+import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float
+from jaxface.geometry.nearest_rotation import rotation_change
 from jaxface.geometry.rotation import axis_angle
 
 
@@ -45,13 +47,34 @@ def pose_from_landmarks(
         image = observed * stretch[:, None]
         image_centre = share @ image
         affine = jnp.linalg.solve(gram, (x * share[:, None]).T @ (image - image_centre)).T
-        u, singular, vt = jnp.linalg.svd(affine, full_matrices=False)
-        rows = u @ vt
-        scale = jnp.maximum(jnp.mean(singular), 1e-12)
-        rotation = jnp.concatenate([rows, jnp.cross(rows[0], rows[1])[None]])
+        rotation, scale = _scaled_rotation(affine)
+        scale = jnp.maximum(scale, 1e-12)
         depth = 1.0 / scale
         middle = jnp.stack([image_centre[0] * depth, image_centre[1] * depth, -depth])
         translation = middle - rotation @ centre
         # depth of each point over the depth of the centre
         stretch = 1.0 - (x @ rotation[2]) / depth
     return axis_angle(rotation), translation
+
+
+@jax.custom_jvp
+def _scaled_rotation(affine: Float[Array, "2 3"]) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
+    """The rotation whose first two rows, times the scale, are nearest to a matrix; and the scale.
+
+    The scale is the mean singular value, ``tr(R^T [A; 0]) / 2``.
+    """
+    u, singular, vt = jnp.linalg.svd(affine, full_matrices=False)
+    rows = u @ vt
+    rotation = jnp.concatenate([rows, jnp.cross(rows[0], rows[1])[None]])
+    return rotation, jnp.mean(singular)
+
+
+@_scaled_rotation.defjvp
+def _scaled_rotation_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    (affine,), (change,) = primals, tangents
+    rotation, scale = _scaled_rotation(affine)
+    whole, moved = (jnp.concatenate([m, jnp.zeros_like(m[:1])]) for m in (affine, change))
+    turned = rotation_change(rotation, whole, moved)
+    return (rotation, scale), (turned, 0.5 * jnp.sum(rotation * moved))

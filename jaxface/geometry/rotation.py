@@ -5,8 +5,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import LEVI_CIVITA
+from jaxface._numerics import LEVI_CIVITA, safe_arctan2, safe_divide, safe_norm
 from jaxface._types import Array, Float
+from jaxface.geometry.nearest_rotation import nearest_rotation
 
 
 def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -49,13 +50,13 @@ def axis_angle(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
         ]
     )
     row = q[jnp.argmax(jnp.diagonal(q))]
-    row = row / jnp.sqrt(jnp.sum(row * row))
+    row = row / jnp.sqrt(jnp.sum(row * row))  # at least 1 for a rotation
     row = jnp.where(row[0] < 0, -row, row)
     w, v = row[0], row[1:]
     s2 = jnp.sum(v * v)
     small = s2 < 1e-8
     s = jnp.sqrt(jnp.where(small, 1.0, s2))
-    factor = jnp.where(small, 2.0 / w, 2.0 * jnp.arctan2(s, w) / s)
+    factor = jnp.where(small, 2.0 / jnp.where(small, w, 1.0), 2.0 * jnp.arctan2(s, w) / s)
     return factor * v
 
 
@@ -69,19 +70,20 @@ def similarity_transform(
 
     Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 1991, with a reflection guarded against. Apply as ``s * x @ R.T + t``.
+    Without extent the scale is 1, without a positive weight all of the result is the identity.
     """
     w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
-    w = w / jnp.sum(w)
+    w = safe_divide(w, jnp.sum(w))
     mean_source = w @ source
     mean_target = w @ target
     x, y = source - mean_source, target - mean_target
-    u, singular, vt = jnp.linalg.svd((w[:, None] * y).T @ x)
-    sign = (
-        jnp.array([1.0, 1.0, 1.0], source.dtype).at[2].set(jnp.linalg.det(u) * jnp.linalg.det(vt))
-    )
-    rotation = (u * sign) @ vt
-    variance = jnp.sum(w[:, None] * x * x)
-    scale = jnp.sum(singular * sign) / variance if with_scale else jnp.ones((), source.dtype)
+    moment = (w[:, None] * y).T @ x
+    rotation = nearest_rotation(moment)
+    scale = jnp.ones((), source.dtype)
+    if with_scale:
+        # The trace is the sum of the singular values, the last one signed.
+        variance = jnp.sum(w[:, None] * x * x)
+        scale = safe_divide(jnp.sum(rotation * moment), variance, 1.0)
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
@@ -90,10 +92,13 @@ def euler_yxz(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """(yaw, pitch, roll) in radians with ``R = Ry(yaw) Rx(pitch) Rz(roll)``.
 
     Yaw is positive when the face turns to its own left (image right), pitch when it looks down.
+    At the pole, a pitch of a right angle, yaw and roll turn about one axis: there the two are zero
+    and the derivative of all three is taken as zero where it does not exist.
     """
     m = matrix
-    pitch = jnp.arcsin(jnp.clip(-m[1, 2], -1.0, 1.0))
-    return jnp.stack([jnp.arctan2(m[0, 2], m[2, 2]), pitch, jnp.arctan2(m[1, 0], m[1, 1])])
+    # By its tangent rather than its sine, which loses half the digits, and its slope, at the pole.
+    pitch = safe_arctan2(-m[1, 2], safe_norm(jnp.stack([m[0, 2], m[2, 2]])))
+    return jnp.stack([safe_arctan2(m[0, 2], m[2, 2]), pitch, safe_arctan2(m[1, 0], m[1, 1])])
 
 
 rotation_matrices = jax.vmap(rotation_matrix)

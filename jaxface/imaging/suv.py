@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._numerics import safe_norm, safe_normalize
+from jaxface._numerics import safe_arctan2, safe_norm, safe_normalize
 from jaxface._types import Array, Float
 
 # Rows: the grey axis, then two axes that span the plane across it.
@@ -144,7 +144,7 @@ def _grid(mask: Array, u: Array, v: Array, sure: Array, cells: int, hues: int):
     # Hues are measured from their mean direction, so that they do not wrap around.
     mean = safe_normalize(jnp.stack([jnp.sum(sure * u), jnp.sum(sure * v)]))
     along, across = u * mean[0] + v * mean[1], v * mean[0] - u * mean[1]
-    hue = jnp.arctan2(across, jnp.where((along == 0) & (across == 0), 1.0, along))
+    hue = safe_arctan2(across, along)
     total = jnp.maximum(jnp.sum(sure), 1e-6)
     width = jnp.sqrt(jnp.sum(sure * hue**2) / total + 1e-6)
     hue = (hue / (2.5 * width) + 1) / 2

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies._photometric_quadratic import shape_basis
 from jaxface.models.morphable import MorphableModel
@@ -44,4 +45,4 @@ def posterior(
     count = basis.shape[-1]
     spread = jnp.einsum("nck,kl->ncl", basis, covariance[:count, :count])
     variance = jnp.einsum("ncl,ncl->n", spread, basis)
-    return Posterior(covariance, jnp.sqrt(jnp.maximum(variance, 0.0)))
+    return Posterior(covariance, safe_sqrt(variance))

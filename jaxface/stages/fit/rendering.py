@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_norm
 from jaxface._types import Array, Bool, Float
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
@@ -46,7 +47,7 @@ def render_fit(
     )
     at_pixel = interpolate(per_vertex, faces, fragments)
     normal = at_pixel[..., :3] @ rotation.T
-    normal = normal / jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    normal = normal / jnp.maximum(safe_norm(normal, keepdims=True), 1e-6)
     covered = fragments.triangle >= 0
     albedo, shading = at_pixel[..., 3:6], irradiance(normal, y.light) + at_pixel[..., 6:]
     color = jnp.where(covered[..., None], albedo * shading, 0.0)
