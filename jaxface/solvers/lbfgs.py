@@ -5,6 +5,7 @@ once, alone, and not once for every place where a jitted line search calls it; b
 caller can look at the point, write it to disk, or stop.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Float, PyTree
+from jaxface.solvers.finiteness import holds_no_number
 
 ValueAndGrad = Callable[[Array, PyTree], tuple[Array, Array]]
 
@@ -50,7 +52,8 @@ def lbfgs_step(
 
     Nocedal and Wright, "Numerical Optimization", algorithms 7.4 and 3.1, with the step of the
     quadratic through the last trial. A pair that does not show positive curvature is not
-    remembered, so the direction always descends.
+    remembered, so the direction always descends. A point where the value or the gradient is not
+    finite is never taken.
 
     Args:
         value_and_grad: of ``(y, args)``, compiled.
@@ -75,12 +78,12 @@ def lbfgs_step(
         value, gradient = value_and_grad(y, args)
         evaluations += 1
         reached = float(value)
+        if not math.isfinite(reached) or holds_no_number(gradient):
+            length *= 0.1
+            continue
         if reached <= start + 1e-4 * length * slope:
             kept = _remember(state, y, gradient)
             return LBFGSState(y, value, gradient, *kept, evaluations), True
-        if not jnp.isfinite(value):
-            length *= 0.1
-            continue
         parabola = -slope * length**2 / (2 * (reached - start - length * slope))
         length = min(max(parabola, 0.1 * length), 0.5 * length)
     return state._replace(pairs=0, evaluations=evaluations), False

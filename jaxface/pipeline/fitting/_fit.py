@@ -22,6 +22,7 @@ from jaxface.models.parameters import FaceParameters
 from jaxface.pipeline.fitting._detail_levels import prepared_levels
 from jaxface.pipeline.fitting.levels import compiling_levels, fit_levels
 from jaxface.run.clock import Clock
+from jaxface.solvers.finiteness import require_finite
 from jaxface.stages.fit import (
     FitConfig,
     FitModel,
@@ -265,6 +266,8 @@ def fit(
             "crop", working_photo, linear, landmarks, mask=mask, focal=focal, size=size
         )
     parameters, stats, models = fit_levels(clock, working.data, models, weights, config)
+    for not_finite in stats.not_finite:
+        require_finite(not_finite, "the fit")
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(parameters)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
     spread = clock.run(

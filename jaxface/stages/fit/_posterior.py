@@ -7,7 +7,7 @@ from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies._photometric_quadratic import shape_basis
 from jaxface.models.morphable import MorphableModel
-from jaxface.solvers._gauss_newton import posterior_covariance
+from jaxface.solvers._posterior_covariance import posterior_covariance
 
 
 class Posterior(eqx.Module):

@@ -94,7 +94,7 @@ class FitStats(eqx.Module):
 
     energies: tuple[dict[str, Array], ...]
     """per level: energy of every term before each step and after the last, one entry more than the
-    most steps of any level, NaN where unused"""
+    most steps of any level, infinite where unused"""
     steps: tuple[Array, ...]
     """steps used on each level"""
     curvature: Float[Array, "p p"]
@@ -103,6 +103,8 @@ class FitStats(eqx.Module):
     """transfer of self-occlusion that the finest level was fitted with"""
     occlusion_slope: Float[Array, "n 3 9"] | None = None
     """its slope in the vertex normals"""
+    not_finite: tuple[dict[str, Array], ...] = ()
+    """per level, what was not finite where it stopped (``solvers.Solution``)"""
 
 
 class LevelRecord(eqx.Module):
@@ -111,6 +113,7 @@ class LevelRecord(eqx.Module):
     energies: dict[str, Array]
     steps: Array
     curvature: Float[Array, "p p"]
+    not_finite: dict[str, Array] = eqx.field(default_factory=dict)
 
 
 def join_records(
@@ -125,4 +128,5 @@ def join_records(
         records[-1].curvature,
         occlusion,
         occlusion_slope,
+        tuple(r.not_finite for r in records),
     )

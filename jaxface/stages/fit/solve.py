@@ -160,7 +160,7 @@ def fit_level(
 
 def _record(solution: Solution) -> LevelRecord:
     stats = solution.stats
-    return LevelRecord(stats["history"], stats["num_steps"], stats["curvature"])
+    return LevelRecord(*(stats[k] for k in ("history", "num_steps", "curvature", "not_finite")))
 
 
 def level_side(data: FitInput, config: FitConfig, level: int) -> int:
