@@ -1,9 +1,11 @@
 """Rotations: axis-angle parameters, matrices, and the closed-form alignment of point sets."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._numerics import LEVI_CIVITA
 from jaxface._types import Array, Float
@@ -60,28 +62,45 @@ def axis_angle(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def similarity_transform(
-    source: Float[Array, "n 3"],
-    target: Float[Array, "n 3"],
-    weights: Float[Array, "n"] | None = None,
+    source: Float[Array | np.ndarray, "n 3"],
+    target: Float[Array | np.ndarray, "n 3"],
+    weights: Float[Array | np.ndarray, "n"] | None = None,
     with_scale: bool = True,
-) -> tuple[Float[Array, ""], Float[Array, "3 3"], Float[Array, "3"]]:
+) -> tuple[
+    Float[Array | np.ndarray, ""], Float[Array | np.ndarray, "3 3"], Float[Array | np.ndarray, "3"]
+]:
     """Scale ``s``, rotation ``R`` and translation ``t`` minimising ``sum w |s R x + t - y|^2``.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 1991, with a reflection guarded against. Apply as ``s * x @ R.T + t``.
+
+    Points in NumPy arrays are aligned on the host, in double precision; in JAX arrays, in their
+    own, and differentiably.
+
+    Raises:
+        ValueError: the sets differ in shape or have fewer than 3 points; or, on the host, the
+            source has no extent.
     """
-    w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
-    w = w / jnp.sum(w)
-    mean_source = w @ source
-    mean_target = w @ target
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"source {source.shape} and target {target.shape}; both need (n, 3)")
+    if len(source) < 3:
+        raise ValueError(f"{len(source)} point pairs; at least 3 are needed")
+    on_host = not isinstance(source, jax.Array) and not isinstance(target, jax.Array)
+    xp: Any = np if on_host else jnp
+    dtype = np.float64 if on_host else jnp.result_type(source, target)
+    source, target = xp.asarray(source, dtype), xp.asarray(target, dtype)
+    w = xp.ones(len(source), dtype) if weights is None else xp.asarray(weights, dtype)
+    w = w / xp.sum(w)
+    mean_source, mean_target = w @ source, w @ target
     x, y = source - mean_source, target - mean_target
-    u, singular, vt = jnp.linalg.svd((w[:, None] * y).T @ x)
-    sign = (
-        jnp.array([1.0, 1.0, 1.0], source.dtype).at[2].set(jnp.linalg.det(u) * jnp.linalg.det(vt))
-    )
+    variance = xp.sum(w[:, None] * x * x)
+    if on_host and variance == 0:
+        raise ValueError("all source points are the same; they need some extent")
+    u, singular, vt = xp.linalg.svd((w[:, None] * y).T @ x)
+    upright = xp.linalg.det(u) * xp.linalg.det(vt) > 0
+    sign = xp.stack([xp.ones((), dtype), xp.ones((), dtype), xp.where(upright, 1.0, -1.0)])
     rotation = (u * sign) @ vt
-    variance = jnp.sum(w[:, None] * x * x)
-    scale = jnp.sum(singular * sign) / variance if with_scale else jnp.ones((), source.dtype)
+    scale = xp.asarray(xp.sum(singular * sign) / variance if with_scale else 1.0, dtype)
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
