@@ -4,15 +4,17 @@ import equinox as eqx
 import numpy as np
 import pytest
 
+from jaxface.geometry.closest_point import closest_weights
 from jaxface.io.face_models.model_file import load_bundled
-from jaxface.pipeline.databases.embedding import _closest_weights, embed_landmarks, with_landmarks
+from jaxface.stages.landmarks import detect_faces
+from jaxface.stages.scan._embed_landmarks import embed_landmarks, with_landmarks
 
 
 @pytest.mark.slow
 def test_finds_the_bundled_landmarks_again():
     model = load_bundled("makehuman")
     bare = eqx.tree_at(lambda m: (m.landmarks68, m.landmarks468), model, (None, None))
-    found = embed_landmarks(bare, yaws=(-15.0, 0.0, 15.0))
+    found = embed_landmarks(bare, detect_faces, yaws=(-15.0, 0.0, 15.0))
     assert found.views == 3
     assert model.landmarks468 is not None and model.landmarks68 is not None
     distance = np.linalg.norm(
@@ -33,7 +35,7 @@ def test_points_on_openings_stay_on_the_outside():
     kept = np.flatnonzero(~np.asarray(hollow))
     change = (model.faces[kept], model.uv_faces[kept], None, None)
     open_eyed = eqx.tree_at(lambda m: (m.faces, m.uv_faces, m.quads, m.uv_quads), model, change)
-    found = embed_landmarks(open_eyed, yaws=(-15.0, 0.0, 15.0))
+    found = embed_landmarks(open_eyed, detect_faces, yaws=(-15.0, 0.0, 15.0))
     assert model.landmarks468 is not None
     distance = np.linalg.norm(
         np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1
@@ -46,7 +48,9 @@ def test_a_model_seen_from_behind_is_refused():
     model = load_bundled("makehuman")
     turned = model.mean * np.array([-1.0, 1.0, -1.0], np.float32)
     with pytest.raises(ValueError, match="finds a face in 0 of 2"):
-        embed_landmarks(eqx.tree_at(lambda m: m.mean, model, turned), yaws=(0.0, 15.0))
+        embed_landmarks(
+            eqx.tree_at(lambda m: m.mean, model, turned), detect_faces, yaws=(0.0, 15.0)
+        )
 
 
 def test_closest_point_of_a_triangle_against_a_dense_search():
@@ -57,7 +61,7 @@ def test_closest_point_of_a_triangle_against_a_dense_search():
     inside = u + v <= 1
     dense = np.stack([1 - u - v, u, v], axis=-1)[inside]
     for place in rng.normal(size=(5, 3)) * 1.5:
-        weights = _closest_weights(place, *np.moveaxis(corners, 1, 0))
+        weights = closest_weights(np.tile(place, (6, 1)), corners)
         assert (weights >= -1e-9).all()
         np.testing.assert_allclose(weights.sum(axis=1), 1.0)
         for triangle, w in zip(corners, weights, strict=True):

@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from jaxface.geometry.closest_point import TriangleTree, closest_weights
-from jaxface.geometry.registration import non_rigid_icp, similarity
+from jaxface.geometry.registration import non_rigid_icp
+from jaxface.geometry.rotation import similarity_transform
 from jaxface.geometry.uv import uv_layout
 from jaxface.io.face_models import load_model
 from jaxface.io.formats.obj import write_obj
-from jaxface.pipeline.databases.scan import register_scan, transfer
+from jaxface.pipeline.databases.scan import register_scan
+from jaxface.stages.scan.transfer import transfer_texture
 
 
 def sphere(level: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +48,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 def test_similarity_is_recovered(seed, scale):
     rng = np.random.default_rng(seed)
     points, rotation, shift = rng.normal(size=(8, 3)), random_rotation(rng), rng.normal(size=3) * 50
-    found = similarity(points, scale * points @ rotation.T + shift)
+    found = similarity_transform(points, scale * points @ rotation.T + shift)
     assert found[0] == pytest.approx(scale, rel=1e-9)
     np.testing.assert_allclose(found[1], rotation, atol=1e-9)
     np.testing.assert_allclose(found[2], shift, atol=1e-8)
@@ -54,17 +56,17 @@ def test_similarity_is_recovered(seed, scale):
 
 def test_similarity_never_mirrors():
     points = np.random.default_rng(0).normal(size=(20, 3))
-    _, rotation, _ = similarity(points, points * [-1, 1, 1])
+    _, rotation, _ = similarity_transform(points, points * [-1, 1, 1])
     assert np.linalg.det(rotation) == pytest.approx(1)
 
 
 def test_similarity_says_what_is_wrong():
     with pytest.raises(ValueError, match="at least 3"):
-        similarity(np.eye(3)[:2], np.eye(3)[:2])
+        similarity_transform(np.eye(3)[:2], np.eye(3)[:2])
     with pytest.raises(ValueError, match="both need"):
-        similarity(np.eye(3), np.eye(4))
+        similarity_transform(np.eye(3), np.eye(4))
     with pytest.raises(ValueError, match="some extent"):
-        similarity(np.ones((4, 3)), np.random.default_rng(0).normal(size=(4, 3)))
+        similarity_transform(np.ones((4, 3)), np.random.default_rng(0).normal(size=(4, 3)))
 
 
 @given(st.integers(0, 10**6))
@@ -180,7 +182,7 @@ def test_a_head_of_the_model_is_found_again(tmp_path):
     size = 128
     u, v = np.meshgrid((np.arange(size) + 0.5) / size, 1 - (np.arange(size) + 0.5) / size)
     layout = uv_layout(model.uv, model.uv_faces, size)
-    over = transfer(found, np.stack([u, v], -1).astype(np.float32), model, layout)
+    over = transfer_texture(found, np.stack([u, v], -1).astype(np.float32), model, layout)
     cheeks = np.asarray(layout(face[:, None].astype(np.float32), model.faces)[..., 0]) > 0.99
     cheeks &= np.asarray(over.known) > 0
     moved_by = np.linalg.norm(np.asarray(over.texture) - np.stack([u, v], -1), axis=-1)[cheeks]

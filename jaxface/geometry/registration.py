@@ -1,4 +1,4 @@
-"""Fitting a template mesh to a scan: a similarity from point pairs, then non-rigid ICP.
+"""Fitting a template mesh to a scan: non-rigid ICP.
 
 On the host, in double precision, by sparse direct solves.
 """
@@ -28,34 +28,6 @@ class Registration:
     """from each vertex to the scan's surface (the scan's units)"""
     matched: Bool[np.ndarray, "n"]
     """vertices that found a match in the last step"""
-
-
-def similarity(
-    source: Float[np.ndarray, "l 3"], target: Float[np.ndarray, "l 3"]
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Scale s, rotation R and translation t with ``target ~ s R source + t``.
-
-    Least squares (Umeyama, "Least-squares estimation of transformation parameters between two
-    point patterns", PAMI 1991).
-
-    Raises:
-        ValueError: the sets differ in shape, or have fewer than 3 points or no extent.
-    """
-    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
-        raise ValueError(f"source {source.shape} and target {target.shape}; both need (l, 3)")
-    if len(source) < 3:
-        raise ValueError(f"{len(source)} point pairs; at least 3 are needed")
-    middle, aim = source.mean(0), target.mean(0)
-    a, b = source - middle, target - aim
-    variance = np.sum(a * a)
-    if variance == 0:
-        raise ValueError("all source points are the same; they need some extent")
-    u, d, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float(np.sum(d * sign) / variance)
-    return scale, rotation, aim - scale * rotation @ middle
 
 
 def non_rigid_icp(

@@ -1,9 +1,11 @@
 """Rotations: axis-angle parameters, matrices, and the closed-form alignment of point sets."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._numerics import LEVI_CIVITA, safe_arctan2, safe_divide, safe_norm
 from jaxface._types import Array, Float
@@ -61,17 +63,32 @@ def axis_angle(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def similarity_transform(
-    source: Float[Array, "n 3"],
-    target: Float[Array, "n 3"],
-    weights: Float[Array, "n"] | None = None,
+    source: Float[Array | np.ndarray, "n 3"],
+    target: Float[Array | np.ndarray, "n 3"],
+    weights: Float[Array | np.ndarray, "n"] | None = None,
     with_scale: bool = True,
-) -> tuple[Float[Array, ""], Float[Array, "3 3"], Float[Array, "3"]]:
+) -> tuple[
+    Float[Array | np.ndarray, ""], Float[Array | np.ndarray, "3 3"], Float[Array | np.ndarray, "3"]
+]:
     """Scale ``s``, rotation ``R`` and translation ``t`` minimising ``sum w |s R x + t - y|^2``.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 1991, with a reflection guarded against. Apply as ``s * x @ R.T + t``.
     Without extent the scale is 1, without a positive weight all of the result is the identity.
+
+    Points in NumPy arrays are aligned on the host, in double precision; in JAX arrays, in their
+    own, and differentiably.
+
+    Raises:
+        ValueError: the sets differ in shape or have fewer than 3 points; or, on the host, the
+            source has no extent.
     """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"source {source.shape} and target {target.shape}; both need (n, 3)")
+    if len(source) < 3:
+        raise ValueError(f"{len(source)} point pairs; at least 3 are needed")
+    if not isinstance(source, jax.Array) and not isinstance(target, jax.Array):
+        return _similarity_on_host(source, target, weights, with_scale)
     w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
     w = safe_divide(w, jnp.sum(w))
     mean_source = w @ source
@@ -84,6 +101,22 @@ def similarity_transform(
         # The trace is the sum of the singular values, the last one signed.
         variance = jnp.sum(w[:, None] * x * x)
         scale = safe_divide(jnp.sum(rotation * moment), variance, 1.0)
+    return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
+def _similarity_on_host(source: Any, target: Any, weights: Any, with_scale: bool) -> Any:
+    source, target = (np.asarray(points, np.float64) for points in (source, target))
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
+    w = w / np.sum(w)
+    mean_source, mean_target = w @ source, w @ target
+    x, y = source - mean_source, target - mean_target
+    variance = np.sum(w[:, None] * x * x)
+    if variance == 0:
+        raise ValueError("all source points are the same; they need some extent")
+    u, singular, vt = np.linalg.svd((w[:, None] * y).T @ x)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float(np.sum(singular * sign) / variance) if with_scale else 1.0
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 

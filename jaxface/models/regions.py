@@ -1,10 +1,13 @@
 """Names for the parts of a face, found from its 68 landmarks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from jaxface._types import Bool, Float, Int
+from jaxface.models.morphable import MorphableModel
 
 REGIONS = (
     "forehead",
@@ -29,6 +32,14 @@ OUTLINE_REGIONS = (*FACE_REGIONS, "neck", "ears")
 
 NOT_SKIN = ("eyes", "mouth_interior")
 """regions that no skin covers"""
+
+
+def in_regions(model: MorphableModel, names: Sequence[str]) -> Bool[np.ndarray, "n"]:
+    """Vertices in any of the named regions; all where the model knows none of them."""
+    known = [model.region_names.index(name) for name in names if name in model.region_names]
+    if not known:
+        return np.ones(model.vertex_count, bool)
+    return np.isin(np.asarray(model.region), known)
 
 
 def label_regions(

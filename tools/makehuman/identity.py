@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from jaxface.geometry.rotation import similarity_transform
 from makehuman.source import Archive, read_target
 
 ETHNICITIES = ("african", "asian", "caucasian")
@@ -186,9 +187,8 @@ def align_rigidly(heads: np.ndarray, members: np.ndarray, rounds: int = 4) -> np
     for _ in range(rounds):
         target = aligned[:, members].mean(0)
         for k, head in enumerate(aligned):
-            u, _, vt = np.linalg.svd(head[members].T @ target)
-            turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-            aligned[k] = (head - head[members].mean(0)) @ turn
+            _, turn, shift = similarity_transform(head[members], target, with_scale=False)
+            aligned[k] = head @ turn.T + shift
     return aligned
 
 

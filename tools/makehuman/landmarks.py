@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from jaxface.geometry.camera import Camera, Pose
+from jaxface.geometry.closest_point import TriangleTree
 from jaxface.geometry.rotation import axis_angle
 from jaxface.geometry.subdivision import catmull_clark
 from jaxface.imaging.colour import linear_to_srgb
@@ -170,37 +171,8 @@ def consensus(
 
 def attach(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> SurfacePoints:
     """The nearest points of a surface (here: skin triangles) as barycentric points."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    members, shares = [], []
-    for point in points:
-        weight = _closest_barycentric(point, a, b, c)
-        place = np.einsum("ti,itc->tc", weight, np.stack([a, b, c]))
-        best = np.linalg.norm(place - point, axis=1).argmin()
-        members.append(triangles[best])
-        shares.append(weight[best])
-    return SurfacePoints(jnp.asarray(np.stack(members)), jnp.asarray(np.stack(shares)))
-
-
-def _closest_barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Barycentrics (t, 3) of the closest point to ``p`` of each triangle."""
-    ab, ac, ap = b - a, c - a, p - a
-    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
-    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
-    determinant = np.maximum(d00 * d11 - d01**2, 1e-12)
-    v = (d11 * d20 - d01 * d21) / determinant
-    w = (d00 * d21 - d01 * d20) / determinant
-    inside = np.stack([1 - v - w, v, w], axis=1)
-    candidates = [np.where(inside.min(axis=1, keepdims=True) >= 0, inside, [1.0, 0.0, 0.0])]
-    for i, (start, end) in enumerate(((a, b), (b, c), (c, a))):
-        edge = end - start
-        t = ((p - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12)
-        weight = np.zeros((len(a), 3))
-        weight[:, i], weight[:, (i + 1) % 3] = 1 - t.clip(0, 1), t.clip(0, 1)
-        candidates.append(weight)
-    stacked = np.stack(candidates)  # (4, t, 3)
-    place = np.einsum("kti,itc->ktc", stacked, np.stack([a, b, c]))
-    best = np.linalg.norm(place - p, axis=2).argmin(axis=0)
-    return stacked[best, np.arange(len(a))]
+    found = TriangleTree(vertices, triangles)(points, candidates=64)
+    return SurfacePoints(jnp.asarray(triangles[found.triangle]), jnp.asarray(found.weights))
 
 
 def _light(direction: tuple[float, float, float], ambient: float) -> jax.Array:

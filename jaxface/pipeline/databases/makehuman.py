@@ -4,22 +4,15 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface.geometry.uv import UVLayout, uv_layout
+from jaxface.geometry.uv import uv_layout
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.face_models import load_model
 from jaxface.io.skin_atlas import atlas_uv, read_skin, skin_name
 from jaxface.io.texture_database import TextureDatabase
-from jaxface.models.morphable import MorphableModel
-from jaxface.models.skin.regions import skin_fields
-from jaxface.stages.scan.transfer import (
-    TransferredTexture,
-    complete_texture,
-    resample_texture,
-)
+from jaxface.stages.scan.transfer import resample_texture, whole_texture
 
 
 def import_skins(
@@ -70,10 +63,3 @@ def import_skins(
         if on_progress is not None:
             on_progress(index + 1, len(names))
     return database
-
-
-def whole_texture(found: TransferredTexture, model: MorphableModel, layout: UVLayout) -> jax.Array:
-    """A transferred texture (linear RGB) with eyes and mouth of the model, and no gaps."""
-    skin = layout(skin_fields(model).regions.skin[:, None], model.faces)[..., 0]
-    elsewhere = layout(jnp.clip(model.albedo_mean, 0.0, 1.0), model.faces)
-    return complete_texture(found, elsewhere, layout, skin)

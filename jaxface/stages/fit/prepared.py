@@ -9,7 +9,7 @@ from jaxface.geometry.mesh import boundary_vertices
 from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
 from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
 from jaxface.models.morphable import MorphableModel, SurfacePoints
-from jaxface.models.regions import FACE_REGIONS, OUTLINE_REGIONS
+from jaxface.models.regions import FACE_REGIONS, OUTLINE_REGIONS, in_regions
 
 
 class FitModel(eqx.Module):
@@ -61,8 +61,8 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
         )
     contour = JAW_68 if landmark_count == 68 else FACE_OVAL
     faces = np.asarray(model.faces)
-    skin = _in_regions(model, FACE_REGIONS)
-    outline = _in_regions(model, OUTLINE_REGIONS)
+    skin = in_regions(model, FACE_REGIONS)
+    outline = in_regions(model, OUTLINE_REGIONS)
     outline = outline & ~boundary_vertices(faces, model.vertex_count)
     return FitModel(
         model=model,
@@ -73,11 +73,3 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
         vertex_mask=jnp.asarray(skin),
         face_mask=jnp.asarray(skin[faces].all(axis=1)),
     )
-
-
-def _in_regions(model: MorphableModel, names: tuple[str, ...]) -> np.ndarray:
-    """Vertices in any of the regions; all vertices where the model knows none of them."""
-    known = [name for name in names if name in model.region_names]
-    if not known:
-        return np.ones(model.vertex_count, bool)
-    return np.isin(np.asarray(model.region), [model.region_names.index(name) for name in known])

@@ -4,12 +4,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._types import Array, Bool, Float
+from jaxface.geometry.closest_point import TriangleTree
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.mipmap import Mipmap, mipmap
 from jaxface.imaging.push_pull import push_pull
 from jaxface.imaging.resample import bilinear
+from jaxface.models.morphable import MorphableModel
+from jaxface.models.skin.regions import skin_fields
+from jaxface.stages.scan.register import RegisteredScan
 
 
 class TransferredTexture(NamedTuple):
@@ -60,6 +65,55 @@ def resample_texture(
     return TransferredTexture(texture, jnp.where(sound, known, 0.0))
 
 
+def surface_uv(
+    registered: RegisteredScan, model: MorphableModel, layout: UVLayout, reach: float = 3.0
+) -> Float[np.ndarray, "r r 2"]:
+    """Where in a scan's maps each texel of a model lies, by the scan's closest point to it.
+
+    Args:
+        registered: the scan.
+        model: the topology.
+        layout: of the model.
+        reach: mm; texels farther from the scan are unknown.
+
+    Returns:
+        Texture coordinates of the scan; NaN where it shows nothing.
+    """
+    scan = registered.scan
+    at = np.asarray(layout(jnp.asarray(registered.vertices, jnp.float32), model.faces, jnp.nan))
+    shown = np.isfinite(at).all(-1)
+    found = TriangleTree(registered.scan_vertices, scan.faces)(at[shown])
+    corners = scan.uv[scan.uv_faces[found.triangle]]
+    uv = np.einsum("qi,qid->qd", found.weights, corners)
+    source_uv = np.full((*shown.shape, 2), np.nan, np.float32)
+    source_uv[shown] = np.where(found.distance[:, None] < reach, uv, np.nan)
+    return source_uv
+
+
+def transfer_texture(
+    registered: RegisteredScan,
+    texture: Float[np.ndarray, "h w c"],
+    model: MorphableModel,
+    layout: UVLayout,
+    reach: float = 3.0,
+) -> TransferredTexture:
+    """A map of the scan in the model's UVs, by the closest point of the scan to each texel.
+
+    Args:
+        registered: the scan.
+        texture: any map in the scan's UVs (linear values).
+        model: the topology.
+        layout: of the model.
+        reach: mm; texels farther from the scan are unknown.
+
+    Returns:
+        A `TransferredTexture`.
+    """
+    source_uv = surface_uv(registered, model, layout, reach)
+    known = jnp.ones(texture.shape[:2], bool)
+    return resample_texture(jnp.asarray(texture), known, jnp.asarray(source_uv), layout)
+
+
 def complete_texture(
     transferred: TransferredTexture,
     elsewhere: Float[Array, "r r 3"],
@@ -83,6 +137,15 @@ def complete_texture(
     texture = texture * skin[..., None] + elsewhere * (1 - skin[..., None])
     present = (layout.triangle >= 0).astype(texture.dtype)
     return jnp.where(present[..., None] > 0, texture, _continued(texture, present))
+
+
+def whole_texture(
+    found: TransferredTexture, model: MorphableModel, layout: UVLayout
+) -> Float[Array, "r r 3"]:
+    """A transferred texture (linear RGB) with eyes and mouth of the model, and no gaps."""
+    skin = layout(skin_fields(model).regions.skin[:, None], model.faces)[..., 0]
+    elsewhere = layout(jnp.clip(model.albedo_mean, 0.0, 1.0), model.faces)
+    return complete_texture(found, elsewhere, layout, skin)
 
 
 def _continued(texture: Float[Array, "r r c"], weight: Float[Array, "r r"]) -> Array:
