@@ -8,6 +8,7 @@ one that is shared too.
 import functools
 import importlib
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Lock
@@ -62,12 +63,14 @@ def run_on_cluster(
     distributed = _distributed()
     folders = folders_of(photos, Path(out).absolute())
     with _client(distributed, scheduler) as client:
+        if photos and not client.scheduler_info()["workers"]:
+            warnings.warn(f"the scheduler at {scheduler!r} has no worker yet", stacklevel=2)
         photo_of = {
             client.submit(digitize_photo, work, photo.absolute(), folder, pure=False): photo
             for photo, folder in zip(photos, folders, strict=True)
         }
         try:
-            for future in distributed.as_completed(photo_of):
+            for future in distributed.as_completed(photo_of, loop=client.loop):
                 photo = photo_of[future]
                 folder = Path(out) / photo.stem
                 if future.status == "finished":
