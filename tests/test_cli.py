@@ -1,6 +1,7 @@
 """The command line as a user types it."""
 
 import json
+import sys
 import warnings
 
 import numpy as np
@@ -37,6 +38,8 @@ def test_help_lists_the_commands():
         ("fit", "demo", "-o", "OUT", "--weights", "photo=-1"),
         ("fit", "demo", "-o", "OUT", "--model", "nobody"),
         ("fit", "demo", "-o", "OUT", "--face", "7"),
+        ("fit", "demo", "-o", "OUT", "--shard", "1/2"),
+        ("digitize", "demo", "-o", "OUT", "--scheduler", "tcp://127.0.0.1:1"),
         ("landmarks", "demo", "-o", "OUT", "--scheme", "dlib5"),
         ("model", "info", "missing.npz"),
         ("database", "build", "no_such_folder", "-o", "OUT", "--licence", "CC0-1.0"),
@@ -99,6 +102,51 @@ def test_empty_folder(tmp_path):
     answer = run("fit", tmp_path, "-o", tmp_path / "out")
     assert answer.exit_code == 2
     assert "no photo" in answer.output.replace("\n", " ")
+
+
+@pytest.fixture
+def fitted(monkeypatch):
+    """Names of the photos that are fitted, by a stand-in that writes a report alone."""
+    names = []
+
+    def stand_in(photo, out, completion, completing, *, on_step, **options):
+        names.append(photo.name)
+        if photo.read_bytes() == b"broken":
+            raise ValueError("no face [in] it")
+        on_step("synthesis", 1, 1)
+        out.mkdir(parents=True)
+        (out / "report.json").write_text("{}")
+
+    monkeypatch.setattr("jaxface.pipeline._digitize._digitize", stand_in)
+    return names
+
+
+def test_a_folder_by_shards(tmp_path, fitted):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in "edcba":
+        (photos / f"{name}.png").write_bytes(b"broken" if name == "d" else b"pixels")
+    given = ("fit", photos, "-o", tmp_path / "out", "--shard")
+    answer = run(*given, "2/2")
+    assert answer.exit_code == 2, answer.output
+    assert fitted == ["b.png", "d.png"]
+    assert "b.png: done" in answer.output and "d.png: no face [in] it" in answer.output
+    assert "1 of 2 photos" in answer.output and "photos 2/2" in answer.output
+    answer = run(*given, "1/2")
+    assert answer.exit_code == 0, answer.output
+    assert fitted[2:] == ["a.png", "c.png", "e.png"]
+    assert "b.png: done before" in run("fit", photos, "-o", tmp_path / "out").output
+    assert run(*given, "6/6").exit_code == 0  # more shards than photos
+    answer = run(*given, "3/2")
+    assert answer.exit_code == 2 and "shard is '3/2'" in answer.output
+
+
+def test_a_scheduler_without_its_package(tmp_path, fitted, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    (tmp_path / "a.png").write_bytes(b"pixels")
+    answer = run("fit", tmp_path, "-o", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1")
+    assert answer.exit_code == 2 and not fitted
+    assert "pip install 'jaxface[cluster]'" in answer.output.replace("\n", " ")
 
 
 def test_landmarks_of_the_demo(tmp_path):

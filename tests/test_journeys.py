@@ -10,7 +10,9 @@ from PIL import Image
 from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
 from jaxface.pipeline import _digitize as journeys
-from jaxface.pipeline._digitize import digitize, digitize_folder
+from jaxface.pipeline import folder as folders
+from jaxface.pipeline._digitize import digitize
+from jaxface.pipeline.folder import digitize_folder
 
 PHOTO = np.full((64, 64, 3), 0.5, np.float32)
 
@@ -51,6 +53,7 @@ def told(monkeypatch):
     monkeypatch.setattr(journeys, "texture", lambda fitted, resolution: None)
     monkeypatch.setattr(journeys, "save_fit", save_fit)
     monkeypatch.setattr(journeys, "complete_folder", complete_folder)
+    monkeypatch.setattr(folders, "complete_folder", complete_folder)
     return calls
 
 

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxface import __version__
-from jaxface.cli import textures
-from jaxface.cli.console import bar, console, errors, progress, steps
+from jaxface.cli import folder, textures
+from jaxface.cli.console import console, errors, progress, steps
 from jaxface.run.compile_cache import enable_compilation_cache
 from jaxface.run.memory import keep_freed_memory
 
@@ -105,6 +105,8 @@ def digitize(
     database: textures.DatabaseOption = None,
     features: textures.FeaturesOption = "random",
     iterations: textures.IterationsOption = 1000,
+    shard: folder.ShardOption = None,
+    scheduler: folder.SchedulerOption = None,
 ) -> None:
     """The whole journey: fit a photo, complete its albedo, write mesh, maps and report."""
     from jaxface.pipeline.texture.options import CompletionOptions
@@ -114,9 +116,8 @@ def digitize(
     with errors():
         settings = CompletionOptions(iterations=iterations)
     _run(
-        photo, out, with_texture=True, resolution=resolution, complete=complete, completion={
-            "database": database, "features": features, "options": settings
-        }, **options,
+        photo, out, shard, scheduler, with_texture=True, resolution=resolution, complete=complete,
+        completion={"database": database, "features": features, "options": settings}, **options,
     )  # fmt: skip
 
 
@@ -133,11 +134,13 @@ def fit(
     size: SizeOption = 512,
     details: DetailsOption = None,
     self_shadow: ShadowOption = True,
+    shard: folder.ShardOption = None,
+    scheduler: folder.SchedulerOption = None,
 ) -> None:
     """The fit alone: mesh with vertex colours, coefficients, overlay and report."""
     options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
     options["self_shadow"] = self_shadow
-    _run(photo, out, with_texture=False, **options)
+    _run(photo, out, shard, scheduler, with_texture=False, **options)
 
 
 @app.command()
@@ -266,38 +269,21 @@ def _integers(option: str, text: str) -> tuple[int, ...]:
         raise ValueError(f"{option} is {text!r}; whole numbers and commas are needed") from None
 
 
-def _run(photo: str, out: Path, **options: Any) -> None:
+def _run(photo: str, out: Path, shard: str | None, scheduler: str | None, **options: Any) -> None:
     if photo != "demo" and Path(photo).is_dir():
-        _run_folder(Path(photo), out, **options)
+        folder.digitize_photos(Path(photo), out, shard, scheduler, **options)
         return
     from jaxface.pipeline import digitize as run
 
-    with errors(), steps(str(photo)) as on_step:
-        fitted = run(photo, out, on_step=on_step, **options)
+    with errors():
+        if shard or scheduler:
+            raise ValueError(f"--shard and --scheduler need a folder of photos; {photo} is none")
+        with steps(str(photo)) as on_step:
+            fitted = run(photo, out, on_step=on_step, **options)
     console.print(
         f"landmark error {fitted.landmark_error():.1%} of the eye distance; "
         f"open [bold]{out / 'report.html'}[/bold]"
     )
-
-
-def _run_folder(folder: Path, out: Path, **options: Any) -> None:
-    from jaxface.pipeline import digitize_folder, photos_in
-
-    failed = 0
-    with errors():
-        photos = photos_in(folder)
-        with bar() as shown:
-            task = shown.add_task("photos", total=len(photos))
-            for entry in digitize_folder(photos, out, **options):
-                shown.advance(task)
-                if entry.error is not None:
-                    failed += 1
-                    console.print(f"[red]{entry.photo.name}[/red]: {entry.error}")
-                elif entry.fitted is None:
-                    console.print(f"{entry.photo.name}: done before")
-    console.print(f"{len(photos) - failed} of {len(photos)} photos in [bold]{out}[/bold]")
-    if failed:
-        raise typer.Exit(2)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -16,23 +17,75 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from jaxface.cli.progress_lines import ProgressLines, beating
+
 console = Console(stderr=True)
-
-
-def bar() -> Progress:
-    """Progress with a spinner, for work whose length is not known."""
-    return Progress(
-        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console,
-        transient=True,
-    )  # fmt: skip
+_AS_IT_IS: Any = {"highlight": False, "soft_wrap": True}
 
 
 @contextmanager
 def progress(text: str) -> Iterator[None]:
-    """A spinner beside a text."""
-    with bar() as shown:
-        shown.add_task(text, total=None)
+    """A text, and that the work goes on: for work whose length is not known."""
+    with _spinner(text) if _is_live() else _lines(text):
         yield
+
+
+@contextmanager
+def steps(text: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress of each kind of work, moved by ``(what, done, of)``.
+
+    On a terminal a bar for each and a spinner beside the text; elsewhere, in a log or a job queue,
+    `ProgressLines`.
+    """
+    with _bars(text) if _is_live() else _lines(text) as move:
+        yield move
+
+
+def _is_live() -> bool:
+    # Rich takes a file for a terminal where the environment asks for colours; a bar needs one.
+    return console.is_interactive and console.file.isatty()
+
+
+@contextmanager
+def _spinner(text: str) -> Iterator[None]:
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True) as shown:
+        shown.add_task(escape(text), total=None)
+        yield
+
+
+@contextmanager
+def _bars(text: str) -> Iterator[Callable[[str, int, int], None]]:
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, TimeElapsedColumn(), console=console) as shown:
+        tasks = {text: shown.add_task(escape(text), total=None)}
+        begun: dict[str, int] = {}
+
+        def move(what: str, done: int, of: int) -> None:
+            if what not in tasks:
+                tasks[what] = shown.add_task(escape(what), total=of)
+            elif done < begun.get(what, 0):  # the next photo's
+                shown.reset(tasks[what])
+            begun[what] = done
+            shown.update(tasks[what], completed=done, total=of)
+
+        yield move
+        shown.update(tasks[text], total=1, completed=1)
+
+
+@contextmanager
+def _lines(text: str) -> Iterator[Callable[[str, int, int], None]]:
+    lines = ProgressLines(lambda line: console.print(line, markup=False, **_AS_IT_IS))
+    lines.say(text)
+    with beating(lines):
+        yield lines.move
+    lines.say(f"{text}: done")
+
+
+def tell(name: str, text: str, wrong: bool = False) -> None:
+    """A line about one thing by its name, in red if something is wrong with it."""
+    name = escape(name)
+    _tell(f"[red]{name}[/red]:" if wrong else f"{name}:", text)
 
 
 @contextmanager
@@ -45,7 +98,14 @@ def errors() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.showwarning = _told
             yield
-    except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
+    except (
+        ValueError,
+        FileNotFoundError,
+        IsADirectoryError,
+        NotADirectoryError,
+        PermissionError,
+        ModuleNotFoundError,
+    ) as error:
         _tell("[bold red]error:[/bold red]", str(error))
         raise typer.Exit(2) from error
 
@@ -57,20 +117,4 @@ def _told(message: Warning | str, category: type[Warning], *place: object, **mor
 
 def _tell(kind: str, text: str) -> None:
     # Square brackets of a message are its own, not markup.
-    console.print(f"{kind} {escape(text)}", highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def steps(text: str) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for each kind of work, moved by ``(what, done, of)``."""
-    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    with Progress(*columns, TimeElapsedColumn(), console=console) as shown:
-        tasks = {text: shown.add_task(text, total=None)}
-
-        def move(what: str, done: int, of: int) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(what, total=of)
-            shown.update(tasks[what], completed=done, total=of)
-
-        yield move
-        shown.update(tasks[text], total=1, completed=1)
+    console.print(f"{kind} {escape(text)}", **_AS_IT_IS)

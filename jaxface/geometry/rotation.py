@@ -89,7 +89,7 @@ def similarity_transform(
         raise ValueError(f"{len(source)} point pairs; at least 3 are needed")
     if not isinstance(source, jax.Array) and not isinstance(target, jax.Array):
         return _similarity_on_host(source, target, weights, with_scale)
-    w = jnp.ones(source.shape[0], source.dtype) if weights is None else weights
+    w = jnp.ones(source.shape[0], source.dtype) if weights is None else jnp.asarray(weights)
     w = safe_divide(w, jnp.sum(w))
     mean_source = w @ source
     mean_target = w @ target

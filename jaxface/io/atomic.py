@@ -2,9 +2,13 @@
 
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_TRIES, _PAUSE = 20, 0.05  # seconds
+_REPLACES_OPEN_FILES = os.name != "nt"
 
 
 @contextmanager
@@ -37,7 +41,20 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         mask = os.umask(0)
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
-        os.replace(temporary, target)
+        _replace(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _replace(source: Path, target: Path) -> None:
+    for _ in range(_TRIES):
+        try:
+            os.replace(source, target)
+            return
+        except PermissionError:
+            # Windows replaces no file that another process has open, and readers are soon done.
+            if _REPLACES_OPEN_FILES:
+                raise
+            time.sleep(_PAUSE)
+    os.replace(source, target)

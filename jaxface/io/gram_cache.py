@@ -101,7 +101,13 @@ class GramCache:
 
     def prune(self, keys: Collection[str], maximum_bytes: int) -> None:
         """Remove the oldest files of other keys until the folder holds no more than allowed."""
-        held = [(p.stat().st_mtime, p.stat().st_size, p) for p in self.path.glob("*.grams")]
+        held = []
+        for path in self.path.glob("*.grams"):
+            try:
+                status = path.stat()
+            except OSError:
+                continue  # another process has removed it
+            held.append((status.st_mtime, status.st_size, path))
         total = sum(size for _, size, _ in held)
         for _, size, path in sorted(held):
             if total > maximum_bytes and path.stem not in keys:

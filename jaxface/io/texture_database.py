@@ -8,7 +8,8 @@
      "subjects": [{"name": ..., "file": ..., "licence": ..., "attributes": {...}}, ...]}
 
 Every file is written whole or not at all, a texture before the entry that names it, so an
-interrupted run leaves a valid database that a later run completes.
+interrupted run leaves a valid database that a later run completes. Several processes may add to one
+database: an entry is added to those that the file has at that moment, under a lock.
 """
 
 import json
@@ -27,6 +28,7 @@ from jaxface._types import Float
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.atomic import atomic_path
 from jaxface.io.cache_folder import cache_dir
+from jaxface.io.file_lock import exclusive
 from jaxface.io.formats.exr import srgb_encoded
 from jaxface.io.formats.image import write_png
 from jaxface.models.maps import uv_digest
@@ -34,6 +36,9 @@ from jaxface.models.morphable import MorphableModel
 
 SCHEMA = "jaxface-textures/1"
 INDEX = "database.json"
+LOCK = ".lock"
+"""held while the index is read and written again"""
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -127,25 +132,21 @@ class TextureDatabase:
         """
         if not 16 <= resolution <= 16384:
             raise ValueError(f"resolution is {resolution}; it needs 16 to 16384 texels")
-        if (Path(path) / INDEX).is_file():
-            present = cls(path, model)
-            if present.resolution != resolution:
-                raise ValueError(
-                    f"{path} holds textures of {present.resolution} texels, not {resolution}; "
-                    "choose another folder"
-                )
-            added = [line for line in credits if line not in present.credits]
-            if added:
+        made = cls.__new__(cls)
+        made.path, made.name, made.licence = Path(path), name, licence
+        made.credits, made.resolution = tuple(credits), resolution
+        made.model, made.digest = model.name, uv_digest(model)
+        made._subjects = {}
+        present = made._as_on_disk(model)
+        # One that lies there with its credits is opened without a lock: it may be read-only.
+        if present is None or set(credits) - set(present.credits):
+            with exclusive(made.path / LOCK):
+                present = made._as_on_disk(model)
+                present = made if present is None else present
+                added = [line for line in credits if line not in present.credits]
                 present.credits = (*present.credits, *added)
-                present._write_index(present._subjects)
-            return present
-        database = cls.__new__(cls)
-        database.path, database.name, database.licence = Path(path), name, licence
-        database.credits, database.resolution = tuple(credits), resolution
-        database.model, database.digest = model.name, uv_digest(model)
-        database._subjects = {}
-        database._write_index({})
-        return database
+                present._write_index()
+        return present
 
     @property
     def subjects(self) -> tuple[Subject, ...]:
@@ -242,11 +243,15 @@ class TextureDatabase:
         subject = Subject(
             name, f"textures/{name}.png", licence or self.licence, dict(attributes or {})
         )
-        entries = {**self._subjects, name: subject}
         json.dumps(subject.attributes, allow_nan=False)  # raises before anything is written
         write_png(self.path / subject.file, srgb_encoded(texture))
-        self._write_index(entries)
-        self._subjects = entries
+        with exclusive(self.path / LOCK):
+            # With what other processes have written since this one has looked.
+            present = self._as_on_disk()
+            present = self if present is None else present
+            self.credits = present.credits
+            self._subjects = {**present._subjects, name: subject}
+            self._write_index()
         return subject
 
     def info(self) -> dict[str, Any]:
@@ -265,7 +270,19 @@ class TextureDatabase:
             "missing": [s.name for s in self.subjects if not self.is_whole(s.name)],
         }
 
-    def _write_index(self, subjects: Mapping[str, Subject]) -> None:
+    def _as_on_disk(self, model: MorphableModel | None = None) -> "TextureDatabase | None":
+        """The database that lies in the folder now, which must be of this one's resolution."""
+        if not (self.path / INDEX).is_file():
+            return None
+        present = TextureDatabase(self.path, model)
+        if present.resolution != self.resolution:
+            raise ValueError(
+                f"{self.path} holds textures of {present.resolution} texels, not "
+                f"{self.resolution}; choose another folder"
+            )
+        return present
+
+    def _write_index(self) -> None:
         content = {
             "schema": SCHEMA,
             "name": self.name,
@@ -273,7 +290,7 @@ class TextureDatabase:
             "credits": list(self.credits),
             "uv": {"model": self.model, "digest": self.digest},
             "resolution": self.resolution,
-            "subjects": [asdict(subject) for subject in subjects.values()],
+            "subjects": [asdict(subject) for subject in self._subjects.values()],
         }
         with atomic_path(self.path / INDEX) as temporary:
             temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

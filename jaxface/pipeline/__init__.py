@@ -4,24 +4,29 @@ Each step is a function of its own and can be replaced: give landmarks, a mask, 
 of your own, or call the stages yourself.
 """
 
-from jaxface.pipeline._digitize import digitize, digitize_folder, open_photo, photos_in
+from jaxface.pipeline._digitize import digitize, open_photo
+from jaxface.pipeline.cluster import digitize_on_cluster
 from jaxface.pipeline.fitting._detail_levels import detail_levels
 from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
 from jaxface.pipeline.fitting.outputs import save_fit
+from jaxface.pipeline.folder import FolderEntry, digitize_folder, photos_in, shard_of
 from jaxface.pipeline.texture.partial import Texture, texture
 from jaxface.run.clock import Clock
 
 __all__ = [
     "Clock",
     "FittedFace",
+    "FolderEntry",
     "Texture",
     "as_photo",
     "detail_levels",
     "digitize",
     "digitize_folder",
+    "digitize_on_cluster",
     "fit",
     "open_photo",
     "photos_in",
     "save_fit",
+    "shard_of",
     "texture",
 ]

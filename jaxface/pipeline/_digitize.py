@@ -1,10 +1,10 @@
-"""Whole journeys: a photo or a folder of photos in, a folder of results out."""
+"""The whole journey: a photo in, a folder of results out."""
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from jaxface.pipeline.texture.folder import (
 from jaxface.pipeline.texture.partial import texture
 
 DEMO = "demo"
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr")
 
 
 def demo_photo() -> Photo:
@@ -149,76 +148,3 @@ def _completion_inputs(
         return None
     side = completion.get("resolution") or resolution
     return open_inputs(model, side, database, completion.get("features", "random"))
-
-
-class FolderEntry(NamedTuple):
-    """What became of one photo of a folder.
-
-    Attributes:
-        photo: its path.
-        out: the folder of its results.
-        fitted: the fit, if it was made now.
-        error: why there is none.
-    """
-
-    photo: Path
-    out: Path
-    fitted: FittedFace | None
-    error: str | None
-
-
-def photos_in(folder: str | os.PathLike[str]) -> list[Path]:
-    """The photos of a folder by name.
-
-    Raises:
-        ValueError: it holds none.
-    """
-    found = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in PHOTO_SUFFIXES)
-    if not found:
-        raise ValueError(f"folder {folder} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
-    return found
-
-
-def digitize_folder(
-    photos: Sequence[Path],
-    out: str | os.PathLike[str],
-    *,
-    on_start: Callable[[Path], None] = lambda photo: None,
-    **options: Any,
-) -> Iterator[FolderEntry]:
-    """Digitize photos one after the other into folders of ``out`` named after them.
-
-    Photos whose folder has a report already are passed over, so a killed run goes on where it
-    stopped; one that cannot be fitted is told and does not end the run. All share one
-    compiled program.
-
-    Args:
-        photos: files with different stems.
-        out: folder.
-        on_start: called before each photo.
-        options: passed to ``digitize``.
-
-    Raises:
-        ValueError: two photos would share a folder, or no completion can be as it is asked for.
-        FileNotFoundError: there is no such model, database or file of weights.
-    """
-    folders = [Path(out) / photo.stem for photo in photos]
-    if len(set(folders)) < len(folders):
-        raise ValueError("photos whose names differ only in the suffix would share a folder")
-    completion, complete = options.pop("completion", None) or {}, options.pop("complete", False)
-    with_texture, resolution = options.get("with_texture", True), options.get("resolution", 2048)
-    options["model"] = model = _loaded(options)
-    inputs = None
-    if complete and with_texture:
-        inputs = _completion_inputs(model, resolution, completion)
-    for photo, folder in zip(photos, folders, strict=True):
-        on_start(photo)
-        fitted = None
-        try:
-            if not (folder / "report.json").is_file():
-                fitted = _digitize(photo, folder, completion, inputs, **options)
-            elif inputs is not None and not (folder / "albedo.png").is_file():
-                complete_folder(folder, **_resources(model, completion, inputs))
-            yield FolderEntry(photo, folder, fitted, None)
-        except (ValueError, FileNotFoundError) as error:
-            yield FolderEntry(photo, folder, None, str(error))

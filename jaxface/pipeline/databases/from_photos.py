@@ -18,9 +18,9 @@ from jaxface.io.atomic import atomic_path
 from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import INDEX, TextureDatabase, check_name
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline._digitize import photos_in
 from jaxface.pipeline.databases.photo_fits import BuildStep, FittedPhoto, fit_photos
 from jaxface.pipeline.fitting._detail_levels import detail_levels
+from jaxface.pipeline.folder import photos_in
 from jaxface.pipeline.texture.partial import texture
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages._common_light import CommonLight, LitVertices, common_light, lit_vertices

@@ -18,8 +18,9 @@ from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.atomic import atomic_path
 from jaxface.io.digest import digest
 from jaxface.io.feature_weights import network_digest
+from jaxface.io.file_lock import exclusive
 from jaxface.io.gram_cache import GramCache
-from jaxface.io.texture_database import TextureDatabase
+from jaxface.io.texture_database import LOCK, TextureDatabase
 from jaxface.networks.texture_features.network import STYLE_LAYERS, FeatureNetwork
 from jaxface.stages.texture.masked_grams import (
     Layout,
@@ -95,8 +96,7 @@ def precompute(
             f"the cache of {len(database)} textures would hold {size} bytes, more than the "
             f"{maximum_bytes} allowed; a lower resolution needs a quarter for each halving"
         )
-    stamps = _read_stamps(files.path)
-    known = stamps.setdefault(identity, {})
+    known = _read_stamps(files.path).get(identity, {})
     compute = jax.jit(lambda network, image: store(network, image, plan))
     keys: list[str] = []
     for index, subject in enumerate(database.subjects):
@@ -106,9 +106,7 @@ def precompute(
             key = digest(identity, image)
             if not files.is_whole(key):
                 files.write(key, compressed(compute(network, jnp.asarray(image)), plan))
-            known[subject.name] = (stamp, key)
-            with atomic_path(files.path / STAMPS) as temporary:
-                temporary.write_text(json.dumps(stamps, indent=1), encoding="utf-8")
+            _write_stamp(files.path, identity, subject.name, (stamp, key))
         keys.append(key)
         on_progress(index + 1, len(database))
     files.prune(keys, maximum_bytes)
@@ -169,6 +167,14 @@ def _read_stamps(folder: Path) -> dict[str, dict[str, tuple[str, str]]]:
         }
     except (OSError, ValueError, TypeError, AttributeError):
         return {}  # absent or damaged: found anew from the textures themselves
+
+
+def _write_stamp(folder: Path, identity: str, subject: str, found: tuple[str, str]) -> None:
+    with exclusive(folder / LOCK):
+        stamps = _read_stamps(folder)
+        stamps.setdefault(identity, {})[subject] = found
+        with atomic_path(folder / STAMPS) as temporary:
+            temporary.write_text(json.dumps(stamps, indent=1), encoding="utf-8")
 
 
 def intensity(encoded: Float[np.ndarray, "r r 3"], side: int) -> Float[np.ndarray, "s s"]:

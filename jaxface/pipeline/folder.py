@@ -1,0 +1,276 @@
+"""A folder of photos in, a folder of results for each out; alone or side by side with others."""
+
+import os
+import re
+import traceback
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+from jaxface.io.face_models.model_file import bundled_models
+from jaxface.io.feature_weights import NAMES
+from jaxface.io.file_lock import claimed
+from jaxface.pipeline import _digitize as one
+from jaxface.pipeline.fitting._fit import FittedFace
+from jaxface.pipeline.texture.folder import (
+    WORK_FOLDER,
+    CompletionInputs,
+    OnStep,
+    complete_folder,
+    silent,
+)
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr")
+LOCKS = ".locks"
+"""folder, among the results, of the locks of the photos that are worked on"""
+
+PATHS = ("model", "landmarks_file", "mask_file", "database", "features")
+"""options that may be paths"""
+
+
+class FolderEntry(NamedTuple):
+    """What became of one photo of a folder.
+
+    Attributes:
+        photo: its path.
+        out: the folder of its results.
+        fitted: the fit, if it was made now and in this process.
+        error: why there is none.
+        state: ``written`` now; ``present``, done before; ``taken``, another process is at it; or
+            ``failed``.
+    """
+
+    photo: Path
+    out: Path
+    fitted: FittedFace | None
+    error: str | None
+    state: Literal["written", "present", "taken", "failed"]
+
+
+class PhotoWork(Protocol):
+    """What is done with each photo; it goes to other processes by pickle."""
+
+    def is_done(self, out: Path) -> bool:
+        """Whether the results in a photo's folder are complete."""
+        ...
+
+    def __call__(self, photo: Path, out: Path, on_step: OnStep) -> FittedFace | None:
+        """Write the results, or what of them is missing."""
+        ...
+
+
+def photos_in(folder: str | os.PathLike[str]) -> list[Path]:
+    """The photos of a folder, hidden files aside, in the order of their names.
+
+    The order is that of the letters' code points, the same on every machine.
+
+    Raises:
+        ValueError: it holds none.
+    """
+    found = [
+        path
+        for path in Path(folder).iterdir()
+        if path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
+    ]
+    if not found:
+        raise ValueError(f"folder {folder} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
+    return sorted(found, key=_order)
+
+
+def shard_of(photos: Sequence[Path], shard: str) -> list[Path]:
+    """The photos of one shard: with ``3/8`` the 3rd, 11th, 19th ... in the order of their names.
+
+    Shards are disjoint and together hold every photo, if all are cut from the same photos.
+
+    Args:
+        photos: all photos, in any order.
+        shard: ``K/N``, with K from 1 to N.
+
+    Returns:
+        The photos of the shard, which may be none.
+
+    Raises:
+        ValueError: ``shard`` is no such text, or two of all photos would share a folder.
+    """
+    matched = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
+    number, count = (int(part) for part in matched.groups()) if matched else (0, 0)
+    if not 1 <= number <= count:
+        raise ValueError(f"shard is {shard!r}; needed is K/N with K from 1 to N, as 3/8")
+    folders_of(photos, ".")
+    return sorted(photos, key=_order)[number - 1 :: count]
+
+
+def folders_of(photos: Sequence[Path], out: str | os.PathLike[str]) -> list[Path]:
+    """The folder of each photo's results, named after it.
+
+    Raises:
+        ValueError: two photos would share a folder.
+    """
+    folders = [Path(out) / photo.stem for photo in photos]
+    if len({os.path.normcase(folder) for folder in folders}) < len(folders):
+        raise ValueError("photos whose names differ only in the suffix would share a folder")
+    return folders
+
+
+def digitize_folder(
+    photos: Sequence[Path],
+    out: str | os.PathLike[str],
+    *,
+    on_start: Callable[[Path], None] = lambda photo: None,
+    on_step: OnStep = silent,
+    **options: Any,
+) -> Iterator[FolderEntry]:
+    """Digitize photos one after the other into folders of ``out`` named after them.
+
+    Photos whose folder is complete are passed over, so a killed run goes on where it stopped; one
+    that cannot be fitted is told and does not end the run. All share one compiled program.
+
+    Several processes may work into one ``out``: a photo that another one is at is passed over too,
+    and looked at once more in the end.
+
+    Args:
+        photos: files with different stems; of many processes each may be given its `shard_of` them.
+        out: folder.
+        on_start: called before each photo that is not done yet.
+        on_step: told of the steps of each completion.
+        options: passed to ``digitize``.
+
+    Raises:
+        ValueError: two photos would share a folder, or no completion can be as it is asked for.
+        FileNotFoundError: there is no such model, database or file of weights.
+    """
+    yield from run_folder(photos, out, Journey(options).prepared(), on_start, on_step)
+
+
+def run_folder(
+    photos: Sequence[Path],
+    out: str | os.PathLike[str],
+    work: PhotoWork,
+    on_start: Callable[[Path], None] = lambda photo: None,
+    on_step: OnStep = silent,
+) -> Iterator[FolderEntry]:
+    """As `digitize_folder`, with any work."""
+    todo = list(zip(photos, folders_of(photos, out), strict=True))
+    for last in (False, True):
+        taken = []
+        for photo, folder in todo:
+            if not work.is_done(folder):
+                on_start(photo)
+            entry = attempt(work, photo, folder, on_step)
+            if entry.state == "taken" and not last:
+                taken.append((photo, folder))
+            else:
+                yield entry
+        todo = taken
+
+
+def attempt(work: PhotoWork, photo: Path, out: Path, on_step: OnStep = silent) -> FolderEntry:
+    """Do the work of one photo, if nobody has done it or is at it; its failure is an answer too.
+
+    Raises:
+        OSError: the folder of the locks, beside ``out``, cannot be written.
+    """
+    if work.is_done(out):
+        return FolderEntry(photo, out, None, None, "present")
+    with claimed(out.parent / LOCKS / f"{out.name}.lock") as free:
+        if not free:
+            return FolderEntry(photo, out, None, None, "taken")
+        if work.is_done(out):  # by another process, since the first look
+            return FolderEntry(photo, out, None, None, "present")
+        try:
+            return FolderEntry(photo, out, work(photo, out, on_step), None, "written")
+        except Exception as error:  # the next photo is none the worse for it
+            return FolderEntry(photo, out, None, reason(error), "failed")
+
+
+def reason(error: BaseException) -> str:
+    """One line that says why a photo failed, with the place if it is no fault of the photo's."""
+    if isinstance(error, ValueError | FileNotFoundError):
+        return str(error)
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{place}"
+
+
+class Journey:
+    """The whole journey of a photo with given options; all that is known of these is here.
+
+    Attributes:
+        options: as ``digitize`` takes them.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self.options = dict(options)
+        self._ready: tuple[dict[str, Any], dict[str, Any], CompletionInputs | None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"options": self.options, "_ready": None}  # what is loaded stays where it is
+
+    def prepared(self) -> "Journey":
+        """Load the model and check the options, which the first photo does otherwise.
+
+        Raises:
+            ValueError: no completion can be as it is asked for.
+            FileNotFoundError: there is no such model, database or file of weights.
+        """
+        self._prepare()
+        return self
+
+    def elsewhere(self) -> "Journey":
+        """The same for a process with another working folder.
+
+        Raises:
+            ValueError: the model is in memory alone.
+        """
+        options, completion = self.options, self.options.get("completion") or {}
+        if "model" in options and not isinstance(options["model"], str | os.PathLike):
+            raise ValueError(
+                f"model is a {type(options['model']).__name__} in memory; for other machines give "
+                "its name, or the path of a file (save_model writes one)"
+            )
+        return Journey({**_absolute(options), "completion": _absolute(completion)})
+
+    def is_done(self, out: Path) -> bool:
+        """Whether the report is there, and the complete albedo where one is asked for."""
+        _, _, inputs = self._prepare()
+        if not (out / "report.json").is_file():
+            return False
+        complete = (out / "albedo.png").is_file() and not (out / WORK_FOLDER).exists()
+        return complete or inputs is None
+
+    def __call__(self, photo: Path, out: Path, on_step: OnStep) -> FittedFace | None:
+        """Fit and complete, or complete what is fitted; raises as ``digitize``."""
+        options, completion, inputs = self._prepare()
+        if not (out / "report.json").is_file():
+            return one._digitize(photo, out, completion, inputs, on_step=on_step, **options)
+        if inputs is not None:
+            given = one._resources(options["model"], completion, inputs)
+            complete_folder(out, on_step=on_step, **given)
+        return None
+
+    def _prepare(self) -> tuple[dict[str, Any], dict[str, Any], CompletionInputs | None]:
+        if self._ready is None:
+            options = dict(self.options)
+            completion = dict(options.pop("completion", None) or {})
+            complete = options.pop("complete", False) and options.get("with_texture", True)
+            options["model"] = model = one._loaded(options)
+            side = options.get("resolution", 2048)
+            inputs = one._completion_inputs(model, side, completion) if complete else None
+            self._ready = options, completion, inputs
+        return self._ready
+
+
+def _absolute(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options with those that are paths of something from the root on; names stay names."""
+    names, found = {*NAMES, *bundled_models()}, dict(options)
+    for key in PATHS:
+        value = found.get(key)
+        if value is not None and str(value) not in names and Path(value).exists():
+            found[key] = str(Path(value).absolute())
+    return found
+
+
+def _order(photo: Path) -> str:
+    # Some file systems take names apart into letters and accents, others put them together.
+    return unicodedata.normalize("NFC", photo.name)
