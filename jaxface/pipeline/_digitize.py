@@ -22,6 +22,7 @@ from jaxface.pipeline.texture.folder import (
     silent,
 )
 from jaxface.pipeline.texture.partial import texture
+from jaxface.run.clock import Clock
 
 DEMO = "demo"
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr")
@@ -107,9 +108,10 @@ def _digitize(
         options["landmarks"] = read_landmarks(landmarks_file).points
     if mask_file is not None:
         options["mask"] = read_mask(mask_file)
-    fitted = fit(photo, **options)
-    textured = texture(fitted, resolution) if with_texture else None
-    save_fit(fitted, out, textured=textured, title=title or "photo")
+    clock = Clock()
+    fitted = fit(photo, clock=clock, **options)
+    textured = texture(fitted, resolution, clock=clock) if with_texture else None
+    save_fit(fitted, out, textured=textured, title=title or "photo", clock=clock)
     del textured
     if completing:
         complete_folder(out, on_step=on_step, **{"model": options["model"], **completion})
