@@ -7,7 +7,7 @@ import numpy as np
 from jaxface._types import Array, Float
 from jaxface.models.morphable import MorphableModel
 from jaxface.stages.fit import FitConfig, FitInput, FitModel, FitWeights, prepare
-from jaxface.stages.fit.solve import fit_landmarks
+from jaxface.stages.fit.start import fit_landmarks
 
 
 def _landmarks_to_shape(

@@ -7,12 +7,12 @@ from fit_metrics import Estimate
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline import FittedFace, fit
+from jaxface.pipeline import Clock, FittedFace, fit
 from jaxface.stages.fit import FitWeights
 
 
-def estimate_of(fitted: FittedFace) -> Estimate:
-    """The figures of a fit that truth is known for."""
+def estimate_of(fitted: FittedFace, clock: Clock) -> Estimate:
+    """The figures of a fit that truth is known for, and its time."""
     y, data, crop = fitted.parameters, fitted.working.data, fitted.working.crop
     points = y.pose(fitted.model.landmarks68(fitted.vertices))
     screen = np.asarray(y.camera(data.principal).project(points))[:, :2]
@@ -27,7 +27,7 @@ def estimate_of(fitted: FittedFace) -> Estimate:
         rotation=np.asarray(rotation_matrix(y.rotation)),
         landmarks=crop.to_photo(screen),
         detected=detected,
-        seconds=fitted.clock.seconds["fit"],
+        seconds=clock.seconds["fit"],
     )
 
 
@@ -38,4 +38,6 @@ def fit_photo(
     weights: FitWeights | None = None,
 ) -> Estimate:
     """Fit a photo (uint8 sRGB) from detected landmarks with the default steps."""
-    return estimate_of(fit(photo, model, details=details, weights=weights))
+    clock, weights = Clock(), weights or FitWeights()
+    fitted = fit(photo, model, details=details, weights=weights, clock=clock)
+    return estimate_of(fitted, clock)

@@ -8,12 +8,14 @@ from .pipeline.fitting.outputs import save_fit
 from .pipeline.texture._complete import complete
 from .pipeline.texture.folder import complete_folder
 from .pipeline.texture.partial import texture
-from .stages.fit import FitWeights
+from .run.compile_cache import enable_compilation_cache
+from .stages.fit import FitOptions, FitWeights
 from .stages.landmarks import detect_faces
 
 __version__: str
 
 __all__ = [
+    "FitOptions",
     "FitWeights",
     "Term",
     "__version__",
@@ -23,6 +25,7 @@ __all__ = [
     "compose",
     "detect_faces",
     "digitize",
+    "enable_compilation_cache",
     "energies",
     "fit",
     "load_model",

@@ -41,7 +41,7 @@ def told(monkeypatch):
         calls.append(("fit", options["model"]))
         return SimpleNamespace(model=options["model"])
 
-    def save_fit(fitted, out, *, textured, title):
+    def save_fit(fitted, out, *, textured, title, clock):
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text("{}")
 
@@ -50,7 +50,7 @@ def told(monkeypatch):
         (folder / "albedo.png").write_bytes(b"")
 
     monkeypatch.setattr(journeys, "fit", fit)
-    monkeypatch.setattr(journeys, "texture", lambda fitted, resolution: None)
+    monkeypatch.setattr(journeys, "texture", lambda fitted, resolution, clock: None)
     monkeypatch.setattr(journeys, "save_fit", save_fit)
     monkeypatch.setattr(journeys, "complete_folder", complete_folder)
     monkeypatch.setattr(folders, "complete_folder", complete_folder)

@@ -256,9 +256,9 @@ def _fit_options(
         if details is not None:
             options["details"] = _integers("--details", details)
         if weights is not None:
-            from jaxface.pipeline.fitting._fit import parse_weights
+            from jaxface import FitWeights
 
-            options["weights"] = parse_weights(weights)
+            options["weights"] = FitWeights.from_text(weights)
     return options
 
 

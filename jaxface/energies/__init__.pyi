@@ -24,6 +24,7 @@ from .photometric import (
     photometric_difference,
     photometric_energy,
     photometric_residual,
+    photometric_root_residual,
     reweighting,
     synthesize,
 )
@@ -65,6 +66,7 @@ __all__ = [
     "photometric_jacobian",
     "photometric_quadratic",
     "photometric_residual",
+    "photometric_root_residual",
     "prior_residual",
     "quadratic_by_autodiff",
     "reweighting",

@@ -106,3 +106,20 @@ def photometric_residual(y: FaceParameters, data: PhotometricData) -> Float[Arra
     """
     difference = photometric_difference(y, data)
     return safe_sqrt(reweighting(difference, data.samples.weight))[:, None] * difference
+
+
+def photometric_root_residual(
+    y: FaceParameters, data: PhotometricData, floor: float = 1e-3
+) -> Float[Array, "p 3"]:
+    """Residual whose squared norm is ``E_c`` itself, for least-squares solvers.
+
+    ``r_p = sqrt(s_p / sum(s)) d_p / (||d_p||^2 + floor^2)^(1/4)``, so that ``||r||^2`` is ``E_c``
+    and its gradient that of ``E_c``, but where ``||d_p||`` comes near to ``floor`` (linear RGB). No
+    weight is held fixed: a solver that lowers it lowers ``E_c``. ``photometric_residual`` is
+    the one that belongs to one step of reweighting.
+    """
+    weight = data.samples.weight
+    share = weight / jnp.maximum(jnp.sum(weight), 1.0)
+    difference = photometric_difference(y, data)
+    square = jnp.sum(difference**2, axis=-1) + floor**2
+    return (safe_sqrt(share) / square**0.25)[:, None] * difference

@@ -1,9 +1,14 @@
 """The unknowns of a fit, ``chi = {V, I, R, t, P, L}`` of Saito 2017, section 3, as one pytree."""
 
-import equinox as eqx
-import jax.numpy as jnp
+import dataclasses
+from collections.abc import Collection
 
-from jaxface._types import Array, Float
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface._types import Array, Float, Int
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.models.morphable import MorphableModel
 
@@ -57,3 +62,47 @@ def neutral_parameters(model: MorphableModel, field_of_view: float = 30.0) -> Fa
         translation=jnp.array([0.0, 0.0, -600.0], dtype),
         log_focal=jnp.asarray(-jnp.log(2 * jnp.tan(jnp.deg2rad(field_of_view) / 2)), dtype),
     )
+
+
+PARAMETER_NAMES = tuple(field.name for field in dataclasses.fields(FaceParameters))
+"""the fields of ``FaceParameters``, in the order in which they are flattened"""
+
+
+def set_apart(
+    y: FaceParameters, names: Collection[str]
+) -> tuple[FaceParameters, FaceParameters | None]:
+    """The unknowns without some fields, and these alone: what is missing is None in each.
+
+    ``put_together`` is the way back. With the first as its unknowns a solver does
+    not know of the others, so that its steps, and derivatives of its answer, hold them exactly.
+
+    Args:
+        y: all unknowns.
+        names: of the fields to be held; with none of them the second part is None.
+
+    Raises:
+        ValueError: a name is no field of ``FaceParameters``.
+    """
+    unknown = sorted(set(names) - set(PARAMETER_NAMES))
+    if unknown:
+        raise ValueError(f"there are no unknowns {unknown}; there are {list(PARAMETER_NAMES)}")
+    if not names:
+        return y, None
+    free = jax.tree.structure(y).unflatten([name not in names for name in PARAMETER_NAMES])
+    return eqx.partition(y, free)
+
+
+def put_together(free: FaceParameters, held: FaceParameters | None) -> FaceParameters:
+    """All unknowns again, from the two parts that ``set_apart`` gives."""
+    return free if held is None else eqx.combine(free, held)
+
+
+def free_columns(y: FaceParameters, names: Collection[str]) -> Int[np.ndarray, "f"]:
+    """Where the flattened unknowns keep all but some fields, as indices.
+
+    Args:
+        y: all unknowns, or their shapes.
+        names: of the fields that are left out.
+    """
+    free = [np.full(np.size(getattr(y, name)), name not in names) for name in PARAMETER_NAMES]
+    return np.flatnonzero(np.concatenate(free))

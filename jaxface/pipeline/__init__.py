@@ -7,14 +7,17 @@ of your own, or call the stages yourself.
 from jaxface.pipeline._digitize import digitize, open_photo
 from jaxface.pipeline.cluster import digitize_on_cluster
 from jaxface.pipeline.fitting._detail_levels import detail_levels
-from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
+from jaxface.pipeline.fitting._fit import as_photo, fit
+from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.fitting.outputs import save_fit
 from jaxface.pipeline.folder import FolderEntry, digitize_folder, photos_in, shard_of
 from jaxface.pipeline.texture.partial import Texture, texture
 from jaxface.run.clock import Clock
+from jaxface.stages.fit.options import FitOptions
 
 __all__ = [
     "Clock",
+    "FitOptions",
     "FittedFace",
     "FolderEntry",
     "Texture",

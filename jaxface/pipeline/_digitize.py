@@ -23,6 +23,7 @@ from jaxface.pipeline.texture.folder import (
     silent,
 )
 from jaxface.pipeline.texture.partial import texture
+from jaxface.run.clock import Clock
 
 DEMO = "demo"
 
@@ -109,9 +110,10 @@ def _digitize(
         options["landmarks"] = read_landmarks(landmarks_file).points
     if mask_file is not None:
         options["mask"] = read_mask(mask_file)
-    fitted = fit(photo, **options)
-    textured = texture(fitted, resolution) if with_texture else None
-    save_fit(fitted, out, textured=textured, title=title or "photo")
+    clock = Clock()
+    fitted = fit(photo, clock=clock, **options)
+    textured = texture(fitted, resolution, clock=clock) if with_texture else None
+    save_fit(fitted, out, textured=textured, title=title or "photo", clock=clock)
     del textured
     if inputs is not None:
         complete_folder(out, on_step=on_step, **_resources(options["model"], completion, inputs))

@@ -1,5 +1,6 @@
 """Where compiled programs are kept between runs, so that the second start is quick."""
 
+import functools
 import os
 import platform
 import tempfile
@@ -54,6 +55,23 @@ def enable_compilation_cache(
     # XLA's own sub-caches put absolute paths into the key, which a moved folder would miss.
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     return folder
+
+
+def keep_compiled() -> None:
+    """``enable_compilation_cache`` where nobody has decided otherwise; what `fit` and its like do.
+
+    Nothing is changed where JAX has a cache already, or is told to have none, or where
+    ``$JAXFACE_CACHE`` is empty. After the first call of a process it costs next to nothing.
+    """
+    values = jax.config.values
+    if values["jax_compilation_cache_dir"] or not values["jax_enable_compilation_cache"]:
+        return
+    _once()
+
+
+@functools.cache
+def _once() -> None:
+    enable_compilation_cache()
 
 
 def _processor_tag() -> str:

@@ -17,6 +17,7 @@ from .fit import (
     FitData,
     FitInput,
     FitModel,
+    FitOptions,
     FitRender,
     FitStats,
     FitWeights,
@@ -25,10 +26,12 @@ from .fit import (
     fit_batch,
     fit_energy,
     fit_parameters,
+    observe_finest,
     posterior,
     prepare,
     render_fit,
     skin_map,
+    weights_as_data,
     working_photo,
 )
 from .landmarks import (
@@ -69,6 +72,7 @@ __all__ = [
     "FitData",
     "FitInput",
     "FitModel",
+    "FitOptions",
     "FitRender",
     "FitStats",
     "FitWeights",
@@ -95,6 +99,7 @@ __all__ = [
     "mirror_uv",
     "mirrored",
     "nearest_subject",
+    "observe_finest",
     "octave_bands",
     "over_low_frequency",
     "plausible_skin",
@@ -112,5 +117,6 @@ __all__ = [
     "with_photo",
     "with_photos_octaves",
     "without_marks",
+    "weights_as_data",
     "working_photo",
 ]

@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from jaxface.pipeline.folder import photos_in
 from jaxface.pipeline.texture.partial import texture
 from jaxface.render.occlusion import self_occlusion
 from jaxface.stages._common_light import CommonLight, LitVertices, common_light, lit_vertices
+from jaxface.stages.fit.options import FitOptions, FitOverrides
 from jaxface.stages.scan.transfer import TransferredTexture, whole_texture
 from jaxface.stages.texture.mirror import fill_from_mirror, mirror_uv
 
@@ -45,7 +46,8 @@ def build_database(
     name: str | None = None,
     model: str | os.PathLike[str] | MorphableModel = "makehuman",
     remove_specularity: bool = True,
-    **options: Any,
+    options: FitOptions | None = None,
+    **overrides: Unpack[FitOverrides],
 ) -> TextureDatabase:
     """Fit every photo of a folder, take its albedo, and write them as a database.
 
@@ -69,14 +71,17 @@ def build_database(
         name: of the database; the folder's by default.
         model: bundled name, model file or model, in whose UVs the textures will be.
         remove_specularity: in SUV space, before unwrapping.
-        options: passed to ``fit``.
+        options: of the fits.
+        overrides: single ones of these, by their names.
 
     Raises:
+        TypeError: an override that is no option of a fit.
         FileNotFoundError: there is no such folder.
         ValueError: the folder holds no photo, or none with a face; two photos have one name; the
             licence is empty; the resolution is not 16 to 16384; or another database lies in
             ``out``.
     """
+    options = dataclasses.replace(options or FitOptions(), **overrides)
     tell = on_progress or (lambda step: None)
     folder = Path(photos_dir)
     if not folder.is_dir():
@@ -104,7 +109,7 @@ def build_database(
         database = begun()
         if all(database.is_whole(n) for n in names):
             return database
-    face = _with_occlusion(face, bool(options.get("self_shadow", True)))
+    face = _with_occlusion(face, options.self_shadow)
     fits, first_problem = fit_photos(photos, names, Path(out) / FITS, face, options, tell)
     if not fits:
         raise ValueError(f"no photo of {folder} could be fitted; the first: {first_problem}")

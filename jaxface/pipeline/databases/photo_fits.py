@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +18,10 @@ from jaxface.io.digest import digest
 from jaxface.io.fit_file import SavedFit, read_fit, write_fit
 from jaxface.models.landmark_schemes import LIPS_OUTER
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
-from jaxface.run.clock import Clock
+from jaxface.pipeline.fitting._fit import as_photo, fit
+from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.stages.fit import FitModel, working_photo
+from jaxface.stages.fit.options import FitOptions
 
 LIP_MARGIN = 0.008
 """of the working image's side, by which lips are taken to be wider than their outline"""
@@ -49,7 +50,7 @@ def fit_photos(
     names: Sequence[str],
     folder: Path,
     model: MorphableModel,
-    options: dict[str, Any],
+    options: FitOptions,
     tell: Callable[[BuildStep], None],
 ) -> tuple[dict[str, SavedFit], str | None]:
     """Fits by subject, made or read again from ``folder``, and the first problem.
@@ -65,10 +66,10 @@ def fit_photos(
             origin = {
                 "model": model.name,
                 "digest": digest(photo.read_bytes()),
-                "options": repr(sorted(options.items())),
+                "options": repr(sorted(options.changed().items())),
             }
             if not _is_current(file, origin):
-                _write_photo_fit(file, fit(photo, model, **options), photo, origin)
+                _write_photo_fit(file, fit(photo, model, options), photo, origin)
             fits[subject] = read_fit(file)
         except (ValueError, OSError) as error:
             problem = f"{photo.name} is left out: {error}"
@@ -136,11 +137,7 @@ class FittedPhoto:
         parameters = self.parameters
         if light is not None:
             parameters = eqx.tree_at(lambda y: y.light, parameters, light)
-        none = cast(Any, None)
-        return FittedFace(
-            linear, working._replace(data=data), self.landmarks, models, parameters, none, none,
-            Clock(),
-        )  # fmt: skip
+        return FittedFace(linear, working._replace(data=data), self.landmarks, models, parameters)
 
 
 def _lips(points: Float[np.ndarray, "l 2"], size: int) -> Float[np.ndarray, "s s"]:

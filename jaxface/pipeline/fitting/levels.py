@@ -46,6 +46,7 @@ def compiling_levels(
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
+    start: FaceParameters | None = None,
 ) -> Iterator[None]:
     """Compile what ``fit_levels`` will run beside what is done inside the ``with``.
 
@@ -57,6 +58,7 @@ def compiling_levels(
         models: as for ``fit_parameters``.
         weights: likewise.
         config: likewise.
+        start: likewise, or its shapes.
     """
     y = jax.eval_shape(neutral_parameters, models[0].model)
     record = LevelRecord({}, y.log_focal, y.identity)
@@ -71,7 +73,7 @@ def compiling_levels(
             return y, *_cast_shapes(args[2])
         return y, record
 
-    through_levels(data, models, weights, config, call)
+    through_levels(data, models, weights, config, call, start)
     drop = clock.begin(calls)
     try:
         yield
@@ -96,6 +98,7 @@ def fit_levels(
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
+    start: FaceParameters | None = None,
 ) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
     """``fit_parameters``, a program a stage: those of ``compiling_levels``, which comes first.
 
@@ -106,4 +109,4 @@ def fit_levels(
     def call(stage: Callable[..., Any], *args: Any) -> Any:
         return clock.run("fit", _program(stage), *args)
 
-    return through_levels(data, models, weights, config, call)
+    return through_levels(data, models, weights, config, call, start)

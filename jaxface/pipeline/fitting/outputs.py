@@ -18,8 +18,9 @@ from jaxface.io.formats.obj import write_obj
 from jaxface.io.pictures.fit_sheet import fit_sheet
 from jaxface.io.pictures.report import write_report
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.fitting._fit import FittedFace
+from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.texture.partial import Texture
+from jaxface.run.clock import Clock
 from jaxface.run.environment import environment
 
 _FILES = {
@@ -40,6 +41,7 @@ def save_fit(
     *,
     textured: Texture | None = None,
     title: str = "fit",
+    clock: Clock | None = None,
 ) -> Path:
     """Write everything a fit yields into a folder; each file whole or not at all.
 
@@ -50,19 +52,26 @@ def save_fit(
         out: folder, made if it does not exist.
         textured: textures to write beside the mesh; without them the mesh has vertex colours.
         title: name of the photo, for the report.
+        clock: that of the run so far; the report has its times.
 
     Returns:
         Path of the HTML report.
+
+    Raises:
+        ValueError: the fit came from a file, without its history.
     """
+    clock = clock or Clock()
+    fitted.estimate_posterior(clock)
+    fitted.skin_map(clock)
+    fitted.render(clock)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    clock = fitted.clock
     if textured is not None:
         clock.host("write textures", _write_textures, folder, textured)
     clock.host("write meshes", _write_meshes, folder, fitted, textured)
     clock.host("write fit", _write_arrays, folder, fitted, textured)
     clock.host("draw overlay", _write_overlay, folder, fitted, title)
-    return write_report(folder, report(fitted, folder, title))[0]
+    return write_report(folder, report(fitted, folder, title, clock))[0]
 
 
 def _write_textures(folder: Path, textured: Texture) -> None:
@@ -141,6 +150,8 @@ def _write_arrays(folder: Path, fitted: FittedFace, textured: Texture | None) ->
         "vertex_deviation_mm": np.asarray(fitted.posterior.vertex_deviation, np.float32),
         "vertices_mm": np.asarray(fitted.vertices, np.float32),
     }
+    if fitted.landmark_depth is not None:
+        arrays["landmark_depth"] = np.asarray(fitted.landmark_depth, np.float32)
     if textured is not None:
         arrays["texels_per_pixel"] = np.asarray(textured.texels_per_pixel)
     metadata = {
@@ -183,13 +194,12 @@ def _write_overlay(folder: Path, fitted: FittedFace, title: str) -> None:
 def histories(fitted: FittedFace) -> list[dict[str, Any]]:
     """Weighted energies before each step and after the last, one record a level."""
     records = []
-    for level, (history, used) in enumerate(
-        zip(fitted.stats.energies, fitted.stats.steps, strict=True)
-    ):
-        side = fitted.size >> max(len(fitted.stats.steps) - 1 - level, 0)
+    stats, levels = fitted.stats, len(fitted.models)
+    coarser = reversed(range(len(stats.steps)))
+    for history, used, halvings in zip(stats.energies, stats.steps, coarser, strict=True):
         records.append(
             {
-                "name": "landmarks only" if level == 0 else f"{side} px",
+                "name": "landmarks only" if halvings == levels else f"{fitted.size >> halvings} px",
                 "steps": int(used),
                 "terms": {
                     name: np.asarray(values)[: int(used) + 1].astype(float).tolist()
@@ -200,8 +210,11 @@ def histories(fitted: FittedFace) -> list[dict[str, Any]]:
     return records
 
 
-def report(fitted: FittedFace, folder: Path, title: str) -> Mapping[str, Any]:
+def report(
+    fitted: FittedFace, folder: Path, title: str, clock: Clock | None = None
+) -> Mapping[str, Any]:
     """What ``report.json`` holds."""
+    clock = clock or Clock()
     y, model = fitted.parameters, fitted.model
     yaw, pitch, roll = np.degrees(np.asarray(euler_yxz(rotation_matrix(y.rotation))))
     spread = np.asarray(fitted.posterior.vertex_deviation)
@@ -240,9 +253,9 @@ def report(fitted: FittedFace, folder: Path, title: str) -> Mapping[str, Any]:
             {
                 "name": name,
                 "seconds": seconds,
-                "compile_seconds": fitted.clock.compiling.get(name, 0.0),
+                "compile_seconds": clock.compiling.get(name, 0.0),
             }
-            for name, seconds in fitted.clock.seconds.items()
+            for name, seconds in clock.seconds.items()
         ],
         "tables": [
             {

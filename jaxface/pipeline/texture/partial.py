@@ -10,7 +10,8 @@ import numpy as np
 from jaxface._compilation import quick_jit
 from jaxface._types import Array, Float
 from jaxface.geometry.uv import UVLayout, uv_layout
-from jaxface.pipeline.fitting._fit import FittedFace
+from jaxface.pipeline.fitting.fitted_face import FittedFace
+from jaxface.run.clock import Clock
 from jaxface.stages._unwrap import PartialAlbedo, unwrap
 from jaxface.stages.fit import fit_hidden_shading
 from jaxface.stages.texture.low_frequency import low_frequency_albedo, over_low_frequency
@@ -31,14 +32,15 @@ class Texture:
     """texels along a side of what one pixel of the photo covers, over what is well seen"""
 
 
-def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
+def texture(fitted: FittedFace, resolution: int = 2048, *, clock: Clock | None = None) -> Texture:
     """The partial albedo of a fit in UV (Saito 2017, section 3), from the photo's own pixels.
 
     Args:
         fitted: the fit.
         resolution: texels along a side.
+        clock: where times are noted.
     """
-    clock, crop, data = fitted.clock, fitted.working.crop, fitted.working.data
+    clock, crop, data = clock or Clock(), fitted.working.crop, fitted.working.data
     y, model = fitted.parameters, fitted.model
     layout = clock.host("uv layout", uv_layout, model.uv, model.uv_faces, resolution)
     height, width = fitted.photo.shape[:2]
@@ -49,7 +51,7 @@ def texture(fitted: FittedFace, resolution: int = 2048) -> Texture:
     fill = [(0, -n % 64) for n in cut.shape[:2]]
     cut = np.pad(cut, (*fill, (0, 0)), mode="edge")
     camera = y.camera(data.principal, crop.side).cropped(jnp.asarray(corner - crop.origin))
-    mask = _mask_on(cut.shape[:2], corner, crop, fitted)
+    mask = _mask_on(cut.shape[:2], corner, crop, fitted.skin_map(clock))
     partial = clock.host(
         "unwrap", lambda: jax.block_until_ready(unwrap(
             jnp.asarray(cut * fitted.working.gain), jnp.asarray(mask),
@@ -82,9 +84,10 @@ def _texels_per_pixel(fitted: FittedFace, partial: PartialAlbedo, layout: UVLayo
     return float(np.sqrt(np.mean(np.asarray(layout.area)[triangle] / pixels[triangle])))
 
 
-def _mask_on(shape: tuple[int, int], corner: np.ndarray, crop: Any, fitted: FittedFace):
+def _mask_on(
+    shape: tuple[int, int], corner: np.ndarray, crop: Any, mask: Float[np.ndarray, "s s"]
+) -> Float[np.ndarray, "h w"]:
     """Pixels of a cut of the photo that show skin: the fit's mask less hair, hands, glasses."""
-    mask = fitted.skin_map()
     ys, xs = np.mgrid[: shape[0], : shape[1]]
     at = (np.stack([xs, ys], axis=-1) + 0.5 + corner - crop.origin) / crop.side * len(mask)
     index = np.clip(at.astype(int), 0, len(mask) - 1)

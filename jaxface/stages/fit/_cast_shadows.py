@@ -57,6 +57,7 @@ def cast_shadows(
     directions: int = 256,
     pixels: int = 3000,
     rounds: int = 4,
+    hold_light: bool = False,
 ) -> tuple[FaceParameters, Float[Array, "n 9"], Float[Array, "n 3 9"]]:
     """The light estimated anew with hard shadows: ``y`` with it, the transfer, and its slope.
 
@@ -85,6 +86,7 @@ def cast_shadows(
         directions: m, over the whole sphere; those that come from far behind the face are left out.
         pixels: number of pixels (evenly spread) that are compared.
         rounds: of reweighting.
+        hold_light: whether the nine coefficients stay those of ``y``.
 
     Raises:
         ValueError: the model has no ``occlusion``.
@@ -139,7 +141,10 @@ def cast_shadows(
     loss, turning = both[:, :3], both[:, 3:].reshape(-1, 3, 3)
     along = jnp.sum(normals[:, :, None] * turning, axis=1, keepdims=True)
     turning = rotation.T @ (turning - normals[:, :, None] * along)
-    light = _harmonics(y.light, samples, normal, albedo, at_pixels(loss), albedo * (lit @ radiance))
+    light = y.light
+    if not hold_light:
+        synth = albedo * (lit @ radiance)
+        light = _harmonics(light, samples, normal, albedo, at_pixels(loss), synth)
     turned_light = sh_rotation(rotation).T @ light
     square = turned_light.T @ turned_light
     square = square + (1e-4 * jnp.trace(square) + 1e-9) * jnp.eye(3, dtype=square.dtype)

@@ -1,12 +1,14 @@
 """How sure a fit is: posterior covariance of the unknowns and standard deviation of each vertex."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies._photometric_quadratic import shape_basis
 from jaxface.models.morphable import MorphableModel
+from jaxface.models.parameters import free_columns, neutral_parameters
 from jaxface.solvers._posterior_covariance import posterior_covariance
 
 
@@ -20,7 +22,10 @@ class Posterior(eqx.Module):
 
 
 def posterior(
-    curvature: Float[Array, "p p"], model: MorphableModel, prior_weight: float | Array
+    curvature: Float[Array, "p p"],
+    model: MorphableModel,
+    prior_weight: float | Float[Array, ""],
+    freeze: tuple[str, ...] = (),
 ) -> Posterior:
     """Laplace approximation from the Gauss-Newton Hessian of a fit.
 
@@ -39,8 +44,14 @@ def posterior(
         curvature: of the weighted energy at the fit, ``FitStats.curvature``.
         model: the level of detail whose vertices are asked for.
         prior_weight: ``w_reg`` of the fit.
+        freeze: the unknowns that the fit has held: they are taken to be known.
     """
-    covariance = posterior_covariance(curvature, 2 * prior_weight)
+    if freeze:
+        kept = free_columns(jax.eval_shape(neutral_parameters, model), freeze)
+        known = posterior_covariance(curvature[kept[:, None], kept], 2 * prior_weight)
+        covariance = jnp.zeros_like(curvature).at[kept[:, None], kept].set(known)
+    else:
+        covariance = posterior_covariance(curvature, 2 * prior_weight)
     basis = shape_basis(model)
     count = basis.shape[-1]
     spread = jnp.einsum("nck,kl->ncl", basis, covariance[:count, :count])

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxface.models.parameters import FaceParameters
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitInput, FitStats, FitWeights, join_records
-from jaxface.stages.fit.solve import fit_level, fit_shadows, fit_start, level_side
+from jaxface.stages.fit.solve import fit_level, fit_shadows, level_side
+from jaxface.stages.fit.start import fit_start
 
 
 def fit_parameters(
@@ -17,6 +18,7 @@ def fit_parameters(
     models: tuple[FitModel, ...],
     weights: FitWeights,
     config: FitConfig,
+    start: FaceParameters | None = None,
 ) -> tuple[FaceParameters, FitStats]:
     """The whole fit as one pure function: jit it, vmap it over ``data``.
 
@@ -25,11 +27,12 @@ def fit_parameters(
         models: the model at each level of detail, coarsest first, one for each pyramid level.
         weights: term weights.
         config: steps and sizes.
+        start: where to begin; by default with the landmarks alone (``fit_start``).
 
     Returns:
         The parameters and the history.
     """
-    y, stats, _ = through_levels(data, models, weights, config)
+    y, stats, _ = through_levels(data, models, weights, config, start=start)
     return y, stats
 
 
@@ -39,6 +42,7 @@ def through_levels(
     weights: FitWeights,
     config: FitConfig,
     call: Callable[..., Any] = lambda stage, *args: stage(*args),
+    start: FaceParameters | None = None,
 ) -> tuple[FaceParameters, FitStats, tuple[FitModel, ...]]:
     """The stages of ``fit_parameters`` in their order, each made by ``call``.
 
@@ -49,12 +53,15 @@ def through_levels(
         config: steps and sizes.
         call: ``call(stage, *args)`` with the answer of ``stage(*args)``, where stage is one of
             ``level_stages``.
+        start: where to begin; by default with the landmarks alone (``fit_start``).
 
     Returns:
         Parameters, history, and the models with the shadows that they were fitted with.
     """
-    y, record = call(fit_start, data, models[0], weights, config)
-    records, shadowed, cast = [record], [], None
+    y, records, shadowed, cast = start, [], [], None
+    if y is None:
+        y, record = call(fit_start, data, models[0], weights, config)
+        records.append(record)
     stages = level_stages(data, models, config)
     for level, (model, (shadows, fitting)) in enumerate(zip(models, stages, strict=True)):
         if shadows is not None:

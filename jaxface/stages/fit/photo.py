@@ -16,6 +16,8 @@ OUTER_EYE_CORNERS = {68: (36, 45), 468: (33, 263)}
 DEFAULT_FOCAL = 1.4
 """focal length over the photo's longer side if the file does not tell: a 50 mm lens at 35 mm"""
 
+WORKING_SIZE = 512
+"""px along a side of the working image, unless another is asked for"""
 
 SMOOTH_SKIN_WEIGHT = 0.1
 """share of the face mesh's points on forehead and cheeks, which no feature of the photo fixes"""
@@ -83,7 +85,9 @@ def working_photo(
     *,
     mask: Float[np.ndarray, "h w"] | None = None,
     focal: float | None = None,
-    size: int = 512,
+    size: int = WORKING_SIZE,
+    estimate_inliers: bool = True,
+    even_landmarks: bool = False,
 ) -> WorkingPhoto:
     """Cut the face out of a photo and bring it to the fit's scale and exposure.
 
@@ -97,6 +101,8 @@ def working_photo(
             which hair, hands and glasses are then looked for.
         focal: focal length in px, if known; else a normal lens is the weak prior.
         size: side of the working image, a multiple of 4.
+        estimate_inliers: whether hair, hands and glasses are looked for where no mask is given.
+        even_landmarks: all landmarks alike, not by what they lie on (``landmark_weights``).
 
     Raises:
         ValueError: wrong number of landmarks, or a photo, mask or landmarks that do not fit.
@@ -135,11 +141,13 @@ def working_photo(
         image=array(crop.image * gain),
         mask=array(valid),
         landmarks=array(inside),
-        landmark_weight=array(landmark_weights(len(points))),
+        landmark_weight=array(
+            np.ones(len(points)) if even_landmarks else landmark_weights(len(points))
+        ),
         landmark_unit=array(np.linalg.norm(inside[left] - inside[right])),
         principal=array(centre),
         log_focal=array(np.log(focal_side)),
         log_focal_deviation=array(0.05 if focal is not None else 0.3),
-        estimate_inliers=jnp.asarray(mask is None),
+        estimate_inliers=jnp.asarray(estimate_inliers and mask is None),
     )
     return WorkingPhoto(data, crop, gain)

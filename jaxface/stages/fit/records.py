@@ -1,13 +1,17 @@
 """What goes into a fit, what one step holds fixed, and what comes out."""
 
-from collections.abc import Sequence
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 
-from jaxface._types import Array, Float
+from jaxface._types import Array, Float, PyTree
 from jaxface.energies.landmark import LandmarkData
 from jaxface.energies.photometric import PhotometricData, PixelSamples
 from jaxface.energies.term import Term
+from jaxface.models.parameters import FaceParameters
 
 
 class FitWeights(eqx.Module):
@@ -31,6 +35,36 @@ class FitWeights(eqx.Module):
     """of the prior on the focal length (not in the paper)"""
     light: float | Array = 2.5e-5
     """of the damping of the light's upper bands (not in the paper)"""
+    extra: Mapping[str, float | Array] = eqx.field(default_factory=dict)
+    """of your own terms, by name (``weights_as_data``)"""
+
+    @classmethod
+    def as_published(cls) -> "FitWeights":
+        """Those of equation 1 of Saito 2017 alone: constants, plain squares, no other prior."""
+        return cls(noise=0.0, landmark_scale=0.0, landmark_turn=0.0, focal=0.0, light=0.0)
+
+    @classmethod
+    def from_text(cls, text: str) -> "FitWeights":
+        """From text such as ``landmark=20,prior=1e-5``; the others keep their defaults.
+
+        Raises:
+            ValueError: an unknown term, or a value that is not a finite number of 0 or more.
+        """
+        values = {}
+        names = tuple(part.name for part in dataclasses.fields(cls) if part.name != "extra")
+        for part in text.split(","):
+            name, _, number = (piece.strip() for piece in part.partition("="))
+            try:
+                value = float(number)
+            except ValueError:
+                value = math.nan
+            if name not in names or not (math.isfinite(value) and value >= 0):
+                raise ValueError(
+                    f"weights has {part.strip()!r}; NAME=NUMBER is needed, the names being "
+                    f"{', '.join(names)} and the numbers 0 or more"
+                )
+            values[name] = value
+        return cls(**values)
 
 
 class FitConfig(eqx.Module):
@@ -49,6 +83,11 @@ class FitConfig(eqx.Module):
     rtol: float = eqx.field(static=True, default=1e-5)
     extra_terms: tuple[Term, ...] = eqx.field(static=True, default=())
     """your own terms, functions of ``(FaceParameters, FitData)``"""
+    freeze: tuple[str, ...] = eqx.field(static=True, default=())
+    """fields of ``FaceParameters`` that stay as they are at the start"""
+    follow_contour: bool = eqx.field(static=True, default=True)
+    """whether contour landmarks slide along the silhouette, and those on surface that turns away
+    lose weight (``slide_contour``); else each stays at its own point, as equation 1 has it"""
 
 
 class FitInput(eqx.Module):
@@ -70,6 +109,8 @@ class FitInput(eqx.Module):
     log_focal_deviation: Float[Array, ""]
     estimate_inliers: Array
     """True: hair, hands and glasses are looked for in the mask; False: the mask is trusted"""
+    user: PyTree = None
+    """arrays of your own, for your own terms"""
 
 
 class FitData(eqx.Module):
@@ -87,10 +128,17 @@ class FitData(eqx.Module):
     focal_prior: tuple[Array, Array]
     weights: FitWeights
     """of the terms"""
+    user: PyTree = None
+    """your own, from ``FitInput``"""
+    held: FaceParameters | None = None
+    """values of the frozen unknowns, the others None; None where all are free"""
 
 
 class FitStats(eqx.Module):
-    """History of a fit, one entry a level (the first is the landmark-only start)."""
+    """History of a fit, one entry a level.
+
+    The first entry is the landmark-only start's, unless the fit was begun elsewhere.
+    """
 
     energies: tuple[dict[str, Array], ...]
     """per level: energy of every term before each step and after the last, one entry more than the
@@ -98,13 +146,19 @@ class FitStats(eqx.Module):
     steps: tuple[Array, ...]
     """steps used on each level"""
     curvature: Float[Array, "p p"]
-    """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian"""
+    """of the energy, from the last step of the finest level: half its Gauss-Newton Hessian; zero
+    in rows and columns of unknowns that were frozen"""
     occlusion: Float[Array, "n 9"] | None = None
     """transfer of self-occlusion that the finest level was fitted with"""
     occlusion_slope: Float[Array, "n 3 9"] | None = None
     """its slope in the vertex normals"""
     not_finite: tuple[dict[str, Array], ...] = ()
     """per level, what was not finite where it stopped (``solvers.Solution``)"""
+
+
+def no_history() -> FitStats:
+    """That of parameters which no fit of this process has found: no level, no curvature."""
+    return FitStats((), (), jnp.zeros((0, 0)))
 
 
 class LevelRecord(eqx.Module):

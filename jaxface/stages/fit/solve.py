@@ -5,34 +5,24 @@ light, by damped Gauss-Newton on iteratively reweighted least squares over an im
 rasteriser finds what is visible again before every step.
 """
 
-import operator
-from collections.abc import Sequence
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from jaxface._numerics import safe_norm
 from jaxface._types import Array, Float, Int
-from jaxface.energies._photometric_quadratic import normal_modes, photometric_quadratic
-from jaxface.energies.landmark import LandmarkData, landmark_difference, landmark_residual
-from jaxface.energies.photometric import PhotometricData, photometric_energy, synthesize
-from jaxface.energies.prior import focal_residual, light_residual, prior_residual
-from jaxface.energies.term import Energy, Quadratic, Term, compose
-from jaxface.geometry.mesh import vertex_normals
-from jaxface.geometry.pose import pose_from_landmarks
+from jaxface.energies._photometric_quadratic import normal_modes
+from jaxface.energies.landmark import LandmarkData, landmark_difference
+from jaxface.energies.photometric import PhotometricData, synthesize
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.pyramid import pyramid
-from jaxface.imaging.resample import bilinear
-from jaxface.models.parameters import FaceParameters, neutral_parameters
-from jaxface.render.occlusion import sh_rotation
-from jaxface.render.shading import sh_basis
+from jaxface.models.parameters import FaceParameters, free_columns, put_together, set_apart
 from jaxface.solvers._gauss_newton import Problem, gauss_newton
 from jaxface.solvers.solution import Solution
 from jaxface.stages.fit._cast_shadows import cast_shadows, shadow_trust
 from jaxface.stages.fit.contour import slide_contour
 from jaxface.stages.fit.inliers import inlier_weights
+from jaxface.stages.fit.objective import fit_energy
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import (
     FitConfig,
@@ -48,60 +38,6 @@ TURNED = 0.94
 """cosine of the head's turn from the camera (20 degrees) up to which landmarks count fully"""
 
 
-def fit_energy(weights: FitWeights | None = None, extra_terms: Sequence[Term] = ()) -> Energy:
-    """Equation 1 of Saito 2017 as composed terms of ``(FaceParameters, FitData)``.
-
-    Args:
-        weights: of the terms; by default those in the data, with respect to which a fit can then
-            be differentiated.
-        extra_terms: your own.
-    """
-    return compose(
-        [
-            Term("photo", _photo_value, _weight(weights, "photo"), "scalar", _photo_quadratic),
-            *_geometric_terms(weights),
-            Term("light", lambda y, d: light_residual(y), _weight(weights, "light")),
-            *extra_terms,
-        ]
-    )
-
-
-def _weight(weights: FitWeights | None, name: str) -> Any:
-    return operator.attrgetter(f"weights.{name}") if weights is None else getattr(weights, name)
-
-
-def _photo_value(y: FaceParameters, data: FitData) -> Float[Array, ""]:
-    return data.photo_trust * photometric_energy(y, data.photo)
-
-
-def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
-    model = photometric_quadratic(y, data.photo, data.normal_modes, data.curvature_samples)
-    return jax.tree.map(lambda x: data.photo_trust * x, model)
-
-
-def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
-    def landmark(y: FaceParameters, d: FitData) -> Array:
-        return jnp.sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
-
-    def focal(y: FaceParameters, d: FitData) -> Array:
-        return focal_residual(y, d.focal_prior)
-
-    return [
-        Term("landmark", landmark, _weight(weights, "landmark")),
-        Term("prior", lambda y, d: prior_residual(y), _weight(weights, "prior")),
-        Term("focal", focal, _weight(weights, "focal")),
-    ]
-
-
-def fit_start(
-    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
-) -> tuple[FaceParameters, LevelRecord]:
-    """Before the first level: pose and coefficients from the landmarks, light in closed form."""
-    y, record = fit_landmarks(data, model, weights, config)
-    image, mask, _ = level_image(data, len(config.steps), 0, level_side(data, config, 0))
-    return initial_light(y, image, mask, data, model), record
-
-
 def fit_shadows(
     y: FaceParameters,
     data: FitInput,
@@ -114,8 +50,9 @@ def fit_shadows(
     """Light, the transfer of its cast shadows, and its slope, from the fit of the level before."""
     image, mask, _ = level_image(data, len(config.steps), level, level_side(data, config, level))
     return cast_shadows(
-        y, image, mask, data, model, coarsest.model, directions=config.shadow_directions
-    )
+        y, image, mask, data, model, coarsest.model, directions=config.shadow_directions,
+        hold_light="light" in config.freeze,
+    )  # fmt: skip
 
 
 def fit_level(
@@ -139,28 +76,35 @@ def fit_level(
         level: may be traced, so that levels of one mesh share a program.
         canvas: side (px) that the level's image is filled up to, at least its own.
     """
-    energy = fit_energy(None, config.extra_terms)
-    problem = Problem(
-        energy=energy.value,
-        quadratic=energy.quadratic,
-        refresh=lambda y, args: observe(y, *args, config=config),
-    )
+    energy = fit_energy(None, config.extra_terms, config.freeze)
     image, mask, side = level_image(data, len(config.steps), level, canvas)
     modes = normal_modes(y, model.model, model.stencil)
+    free, held = set_apart(y, config.freeze)
+
+    def refresh(free, args):
+        held, *rest = args
+        return observe(put_together(free, held), *rest, config=config)
+
     solution = gauss_newton(
-        problem,
-        y,
-        (image, mask, side, data, model, modes, weights),
+        Problem(energy.value, energy.quadratic, refresh),
+        free,
+        (held, image, mask, side, data, model, modes, weights),
         steps=max(config.steps),
         limit=jnp.asarray(config.steps)[level],
         rtol=config.rtol,
     )
-    return solution.value, _record(solution)
+    return put_together(solution.value, held), record_of(solution, y, config)
 
 
-def _record(solution: Solution) -> LevelRecord:
+def record_of(solution: Solution, y: FaceParameters, config: FitConfig) -> LevelRecord:
+    """What a level's solver tells, its curvature for all unknowns."""
     stats = solution.stats
-    return LevelRecord(*(stats[k] for k in ("history", "num_steps", "curvature", "not_finite")))
+    curvature = stats["curvature"]
+    if config.freeze:
+        kept, count = free_columns(y, config.freeze), sum(x.size for x in jax.tree.leaves(y))
+        whole = jnp.zeros((count, count), curvature.dtype)
+        curvature = whole.at[kept[:, None], kept].set(curvature)
+    return LevelRecord(stats["history"], stats["num_steps"], curvature, stats["not_finite"])
 
 
 def level_side(data: FitInput, config: FitConfig, level: int) -> int:
@@ -193,7 +137,8 @@ def observe(
 ) -> FitData:
     """What is visible at ``y``: the pixel lists and where contour landmarks attach.
 
-    No gradient passes: visibility and inliers are choices, held fixed by every derivative.
+    No gradient passes but to the values of frozen unknowns: visibility and inliers are choices,
+    held fixed by every derivative.
 
     Args:
         y: the unknowns.
@@ -204,8 +149,9 @@ def observe(
         model: level of detail.
         modes: derivative of the vertex normals along the shape modes (``normal_modes``).
         weights: of the terms.
-        config: how many pixels are compared.
+        config: how many pixels are compared, what is frozen, whether contours slide.
     """
+    _, held = set_apart(y, config.freeze)
     y = jax.lax.stop_gradient(y)
     samples = visible_samples(y, image, mask, side, data, model, config.compared_pixels)
     trusted = shadow_trust(y, model.model, samples)
@@ -217,7 +163,7 @@ def observe(
     misfit = jnp.sum(samples.weight * safe_norm(samples.color - synth))
     misfit = misfit / jnp.maximum(jnp.sum(samples.weight), 1.0)
     trust = weights.noise / jnp.maximum(misfit, 0.2 * weights.noise + 1e-9)
-    landmark = slide_contour(y, landmark_data(data, model), model.contour, model.outline)
+    landmark = landmarks_at(y, data, model, config)
     distance = safe_norm(landmark_difference(y, landmark)) / landmark.unit
     scale = jnp.asarray(weights.landmark_scale, distance.dtype)
     outlier = jnp.where(scale > 0, distance / jnp.where(scale > 0, scale, 1.0), 0.0)
@@ -231,7 +177,26 @@ def observe(
         normal_modes=modes,
         focal_prior=(data.log_focal, data.log_focal_deviation),
         weights=weights,
+        user=data.user,
+        held=held,
     )
+
+
+def observe_finest(
+    y: FaceParameters, data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
+) -> FitData:
+    """``observe`` on the whole working image: what a step from ``y`` on the last level holds fixed.
+
+    Args:
+        y: the unknowns.
+        data: the photo.
+        model: the finest level of detail.
+        weights: of the terms.
+        config: how many pixels are compared.
+    """
+    modes = normal_modes(y, model.model, model.stencil)
+    side = jnp.asarray(len(data.image), data.image.dtype)
+    return observe(y, data.image, data.mask, side, data, model, modes, weights, config=config)
 
 
 def landmark_trust(y: FaceParameters, power: float | Float[Array, ""]) -> Float[Array, ""]:
@@ -244,6 +209,16 @@ def landmark_trust(y: FaceParameters, power: float | Float[Array, ""]) -> Float[
     return jnp.clip(front / TURNED, 0.1, 1.0) ** power
 
 
+def landmarks_at(
+    y: FaceParameters, data: FitInput, model: FitModel, config: FitConfig
+) -> LandmarkData:
+    """The landmarks as a step from ``y`` compares them."""
+    landmarks = landmark_data(data, model)
+    if not config.follow_contour:
+        return landmarks
+    return slide_contour(y, landmarks, model.contour, model.outline)
+
+
 def landmark_data(data: FitInput, model: FitModel) -> LandmarkData:
     """Landmarks at their own places on the mesh, before contours slide."""
     return LandmarkData(
@@ -254,80 +229,3 @@ def landmark_data(data: FitInput, model: FitModel) -> LandmarkData:
         principal=data.principal,
         unit=data.landmark_unit,
     )
-
-
-def fit_landmarks(
-    data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
-) -> tuple[FaceParameters, LevelRecord]:
-    """Closed-form pose, then pose, camera and coefficients from landmarks and prior alone."""
-    y = neutral_parameters(model.model)
-    y = eqx.tree_at(lambda p: p.log_focal, y, data.log_focal)
-    # The outline moves with the viewpoint; the inner points alone give a steadier first pose.
-    inner = data.landmark_weight.at[model.contour].set(0.0)
-    rotation, translation = pose_from_landmarks(
-        model.points(model.model.mean),
-        data.landmarks,
-        inner,
-        jnp.exp(data.log_focal),
-        data.principal,
-    )
-    y = eqx.tree_at(lambda p: (p.rotation, p.translation), y, (rotation, translation))
-    energy = compose(_geometric_terms())
-
-    def refresh(y, args):
-        data, model, weights = args
-        return _GeometricData(
-            slide_contour(y, landmark_data(data, model), model.contour, model.outline),
-            jnp.ones((), y.light.dtype),
-            (data.log_focal, data.log_focal_deviation),
-            weights,
-        )
-
-    problem = Problem(energy.value, energy.quadratic, refresh)
-    solution = gauss_newton(
-        problem, y, (data, model, weights), steps=config.landmark_steps, rtol=config.rtol
-    )
-    return solution.value, _record(solution)
-
-
-class _GeometricData(eqx.Module):
-    landmark: LandmarkData
-    landmark_trust: Array
-    focal_prior: tuple[Array, Array]
-    weights: FitWeights
-
-
-def initial_light(
-    y: FaceParameters,
-    image: Float[Array, "s s 3"],
-    mask: Float[Array, "s s"],
-    data: FitInput,
-    model: FitModel,
-) -> FaceParameters:
-    """Light in closed form: linear least squares over the vertices, shape and albedo held.
-
-    Vertices count by how much they face the camera; whether another part of the face hides them
-    from it is ignored, which is good enough for a start. The upper bands are damped (a ridge of
-    0.02 of the ambient column), as a face shows only half the sphere of normals.
-    """
-    size = image.shape[0]
-    shape = model.model.shape(y.identity, y.expression)
-    rotation = rotation_matrix(y.rotation)
-    normal = vertex_normals(shape, model.model.faces) @ rotation.T
-    posed = y.pose(shape)
-    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
-    facing = jnp.maximum(jnp.sum(normal * view, axis=-1) - 0.2, 0.0)
-    screen = y.camera(data.principal, size).project(posed)[:, :2]
-    seen = bilinear(jnp.concatenate([image, mask[..., None]], axis=-1), screen)
-    weight = facing * seen[:, 3] * model.vertex_mask
-    weight = weight / jnp.maximum(jnp.sum(weight), 1e-6)
-    harmonics = sh_basis(normal)
-    if model.model.occlusion is not None:
-        harmonics = harmonics + model.model.occlusion @ sh_rotation(rotation).T
-    columns = harmonics[:, None, :] * model.model.reflectance(y.albedo)[:, :, None]
-    gram = jnp.einsum("n,nci,ncj->cij", weight, columns, columns)
-    rhs = jnp.einsum("n,nci,nc->ci", weight, columns, seen[:, :3])
-    ridge = jnp.diag(jnp.array([1e-4] + [0.02] * 8, gram.dtype))
-    gram = gram + ridge * jnp.maximum(gram[:, :1, :1], 1e-6)
-    light = jnp.linalg.solve(gram, rhs[..., None])[..., 0].T
-    return eqx.tree_at(lambda p: p.light, y, light)
