@@ -26,7 +26,7 @@ from harness import Benchmark, Measurement
 
 from jaxface.io.face_models import load_model
 from jaxface.pipeline import Clock, FittedFace, fit
-from jaxface.pipeline._digitize import demo_photo
+from jaxface.pipeline.photo import demo_photo
 from jaxface.run.compile_cache import ENVIRONMENT, enable_compilation_cache
 
 DETAILS = {"default": (0, 1, 1), "fine": (0, 1, 2)}

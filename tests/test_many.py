@@ -1,5 +1,6 @@
 """A folder of photos by many processes: shards, locks, a shared database, a scheduler."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -29,6 +30,8 @@ from jaxface.pipeline.folder import (
     run_folder,
     shard_of,
 )
+from jaxface.pipeline.options import DigitizeOptions
+from jaxface.stages.fit.options import FitOptions
 from tests.photo_stamps import Stamps, photos, processes, written
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -292,32 +295,24 @@ def test_a_journey_goes_to_another_folder_and_process(tmp_path, monkeypatch):
     Path("makehuman").mkdir()
     Path("skins").mkdir()
     Path("random").touch()
-    journey = Journey(
-        {
-            "model": "makehuman", "size": 128, "completion": {
-                "database": Path("skins"), "features": "random",
-            },
-        }
-    )  # fmt: skip
-    sent = pickle.loads(pickle.dumps(journey.prepared().elsewhere()))
-    assert sent.options == {
-        "model": "makehuman", "size": 128, "completion": {
-            "database": str(tmp_path / "skins"), "features": "random",
-        },
-    }  # fmt: skip
+    options = DigitizeOptions(
+        fit=FitOptions(size=128), complete=False, database=Path("skins"), features="random"
+    )
+    sent = pickle.loads(pickle.dumps(Journey(options).prepared().elsewhere()))
+    assert sent.options == dataclasses.replace(options, database=str(tmp_path / "skins"))
     with pytest.raises(ValueError, match="MorphableModel in memory"):
-        Journey({"model": load_model("makehuman")}).elsewhere()
+        Journey(DigitizeOptions(model=load_model("makehuman"))).elsewhere()
 
 
 def test_a_cut_completion_is_not_done(tmp_path):
     """The albedo is there before the report tells of it; the kept levels go last."""
-    journey = Journey({"complete": True})
+    journey = Journey(DigitizeOptions())
     for name, done in [("report.json", False), ("albedo.png", True)]:
         (tmp_path / name).touch()
         assert journey.is_done(tmp_path) is done
     (tmp_path / ".completion").mkdir()
     assert not journey.is_done(tmp_path)
-    assert Journey({"complete": False}).is_done(tmp_path)
+    assert Journey(DigitizeOptions(complete=False)).is_done(tmp_path)
 
 
 def test_an_absent_scheduler_package_names_the_remedy(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 
 import json
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +12,12 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxface import __version__
-from jaxface.cli import folder, textures
+from jaxface.cli import folder, options, textures
 from jaxface.cli.console import console, errors, progress, steps
+from jaxface.cli.options import changed, with_options
+from jaxface.pipeline import FitOptions
+from jaxface.pipeline.options import DigitizeOptions
+from jaxface.pipeline.texture.options import CompletionOptions
 from jaxface.run.compile_cache import enable_compilation_cache
 from jaxface.run.memory import keep_freed_memory
 
@@ -46,101 +52,54 @@ def _command(
 
 PhotoArgument = Annotated[str, typer.Argument(help="Photo, folder of photos, or `demo`.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write into.")]
-ModelOption = Annotated[
-    str,
-    typer.Option("--model", help="Bundled name or model file (.npz .mat .h5 .pkl .bin, folder)."),
-]
-LandmarksOption = Annotated[
-    Path | None,
-    typer.Option("--landmarks", help="Points to use instead of detection: .json, .pts or .txt."),
-]
-MaskOption = Annotated[
-    Path | None, typer.Option("--mask", help="Image of the photo's size, white on face skin.")
-]
-FaceOption = Annotated[
-    int | None,
-    typer.Option("--face", help="Which face, from the largest (0), if there are several."),
-]
-LevelsOption = Annotated[
-    str, typer.Option("--levels", help="Steps on each pyramid level, coarsest first.")
-]
-WeightsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--weights",
-        help="Term weights that differ from the defaults, as photo=1,landmark=10,prior=2.5e-5.",
-    ),
-]
-SizeOption = Annotated[int, typer.Option("--size", help="Side of the working image, px.")]
-DetailsOption = Annotated[
-    str | None,
-    typer.Option("--details", help="Subdivisions of the model at each level, as 0,1,2."),
-]
-ShadowOption = Annotated[
-    bool,
-    typer.Option(help="Shade with what the face hides from itself of the light, or as the paper."),
-]
-ResolutionOption = Annotated[
-    int, typer.Option("--resolution", help="Texels along a texture's side.")
-]
 
 
 @app.command()
+@with_options(DigitizeOptions, "texture", options.TEXTURE)
+@with_options(CompletionOptions, "completion", options.COMPLETION)
+@with_options(FitOptions, "fitting", options.FIT)
+@with_options(DigitizeOptions, "journey", options.JOURNEY)
 def digitize(
     photo: PhotoArgument,
     out: OutOption,
-    model: ModelOption = "makehuman",
-    landmarks: LandmarksOption = None,
-    mask: MaskOption = None,
-    face: FaceOption = None,
-    levels: LevelsOption = "30,10,3",
-    weights: WeightsOption = None,
-    size: SizeOption = 512,
-    details: DetailsOption = None,
-    self_shadow: ShadowOption = True,
-    resolution: ResolutionOption = 2048,
-    complete: Annotated[
-        bool, typer.Option(help="Complete the albedo where the photo does not show it.")
-    ] = True,
-    database: textures.DatabaseOption = None,
-    features: textures.FeaturesOption = "random",
-    iterations: textures.IterationsOption = 1000,
+    journey: Mapping[str, Any],
+    fitting: Mapping[str, Any],
+    completion: Mapping[str, Any],
+    texture: Mapping[str, Any],
+    as_published: options.AsPublished = False,
     shard: folder.ShardOption = None,
     scheduler: folder.SchedulerOption = None,
 ) -> None:
     """The whole journey: fit a photo, complete its albedo, write mesh, maps and report."""
-    from jaxface.pipeline.texture.options import CompletionOptions
-
-    options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
-    options["self_shadow"] = self_shadow
     with errors():
-        settings = CompletionOptions(iterations=iterations)
-    _run(
-        photo, out, shard, scheduler, with_texture=True, resolution=resolution, complete=complete,
-        completion={"database": database, "features": features, "options": settings}, **options,
-    )  # fmt: skip
+        asked = DigitizeOptions.as_published() if as_published else DigitizeOptions()
+        asked = replace(
+            asked,
+            fit=changed(asked.fit, options.FIT, fitting),
+            completion=changed(asked.completion, options.COMPLETION, completion),
+        )
+        asked = changed(asked, {**options.JOURNEY, **options.TEXTURE}, {**journey, **texture})
+    _run(photo, out, asked, shard, scheduler)
 
 
 @app.command()
+@with_options(FitOptions, "fitting", options.FIT)
+@with_options(DigitizeOptions, "journey", options.JOURNEY)
 def fit(
     photo: PhotoArgument,
     out: OutOption,
-    model: ModelOption = "makehuman",
-    landmarks: LandmarksOption = None,
-    mask: MaskOption = None,
-    face: FaceOption = None,
-    levels: LevelsOption = "30,10,3",
-    weights: WeightsOption = None,
-    size: SizeOption = 512,
-    details: DetailsOption = None,
-    self_shadow: ShadowOption = True,
+    journey: Mapping[str, Any],
+    fitting: Mapping[str, Any],
+    as_published: options.AsPublished = False,
     shard: folder.ShardOption = None,
     scheduler: folder.SchedulerOption = None,
 ) -> None:
     """The fit alone: mesh with vertex colours, coefficients, overlay and report."""
-    options = _fit_options(model, landmarks, mask, face, levels, weights, size, details)
-    options["self_shadow"] = self_shadow
-    _run(photo, out, shard, scheduler, with_texture=False, **options)
+    with errors():
+        asked = FitOptions.as_published() if as_published else FitOptions()
+        asked = DigitizeOptions(fit=changed(asked, options.FIT, fitting), with_texture=False)
+        asked = changed(asked, options.JOURNEY, journey)
+    _run(photo, out, asked, shard, scheduler)
 
 
 @app.command()
@@ -234,44 +193,11 @@ def model_embed_landmarks(
     )
 
 
-def _fit_options(
-    model: str,
-    landmarks: Path | None,
-    mask: Path | None,
-    face: int | None,
-    levels: str,
-    weights: str | None,
-    size: int,
-    details: str | None,
-) -> dict[str, Any]:
-    with errors():
-        options: dict[str, Any] = {
-            "model": model,
-            "landmarks_file": landmarks,
-            "mask_file": mask,
-            "face": face,
-            "steps": _integers("--levels", levels),
-            "size": size,
-        }
-        if details is not None:
-            options["details"] = _integers("--details", details)
-        if weights is not None:
-            from jaxface import FitWeights
-
-            options["weights"] = FitWeights.from_text(weights)
-    return options
-
-
-def _integers(option: str, text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} is {text!r}; whole numbers and commas are needed") from None
-
-
-def _run(photo: str, out: Path, shard: str | None, scheduler: str | None, **options: Any) -> None:
+def _run(
+    photo: str, out: Path, asked: DigitizeOptions, shard: str | None, scheduler: str | None
+) -> None:
     if photo != "demo" and Path(photo).is_dir():
-        folder.digitize_photos(Path(photo), out, shard, scheduler, **options)
+        folder.digitize_photos(Path(photo), out, asked, shard, scheduler)
         return
     from jaxface.pipeline import digitize as run
 
@@ -279,7 +205,7 @@ def _run(photo: str, out: Path, shard: str | None, scheduler: str | None, **opti
         if shard or scheduler:
             raise ValueError(f"--shard and --scheduler need a folder of photos; {photo} is none")
         with steps(str(photo)) as on_step:
-            fitted = run(photo, out, on_step=on_step, **options)
+            fitted = run(photo, out, asked, on_step=on_step)
     console.print(
         f"landmark error {fitted.landmark_error():.1%} of the eye distance; "
         f"open [bold]{out / 'report.html'}[/bold]"

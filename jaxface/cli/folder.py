@@ -2,11 +2,12 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from jaxface.cli.console import console, errors, steps, tell
+from jaxface.pipeline.options import DigitizeOptions
 
 ShardOption = Annotated[
     str | None,
@@ -24,16 +25,16 @@ _STATES = {"written": "done", "present": "done before", "taken": "another proces
 
 
 def digitize_photos(
-    folder: Path, out: Path, shard: str | None, scheduler: str | None, **options: Any
+    folder: Path, out: Path, asked: DigitizeOptions, shard: str | None, scheduler: str | None
 ) -> None:
     """Digitize a folder, here or over a scheduler; exit code 2 if a photo fails.
 
     Args:
         folder: of the photos.
         out: for a folder of results for each.
+        asked: the settings.
         shard: of the photos, or None for all.
         scheduler: of dask.distributed, or None for this process.
-        options: of `digitize_folder`.
     """
     from jaxface.pipeline import digitize_folder, digitize_on_cluster, photos_in, shard_of
 
@@ -43,11 +44,11 @@ def digitize_photos(
         photos = photos if shard is None else shard_of(photos, shard)
         with steps(str(folder)) as on_step:
             if scheduler is not None:
-                entries = digitize_on_cluster(photos, out, scheduler, **options)
+                entries = digitize_on_cluster(photos, out, scheduler, asked)
             else:
                 entries = digitize_folder(
-                    photos, out, on_start=lambda photo: tell(photo.name, "begun"), on_step=on_step,
-                    **options,
+                    photos, out, asked,
+                    on_start=lambda photo: tell(photo.name, "begun"), on_step=on_step,
                 )  # fmt: skip
             for number, entry in enumerate(entries, 1):
                 found[entry.state] += 1

@@ -1,6 +1,7 @@
 """Commands of the texture: complete an albedo, and what that needs."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -8,70 +9,48 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from jaxface.cli import options
 from jaxface.cli.console import console, errors, steps
+from jaxface.cli.options import changed, with_options
+from jaxface.pipeline.options import DigitizeOptions
+from jaxface.pipeline.texture.options import CompletionOptions
 
 database_app = typer.Typer(no_args_is_help=True, help="Texture databases: list, make, describe.")
 features_app = typer.Typer(no_args_is_help=True, help="Feature networks of the texture statistics.")
 
-DatabaseOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--database",
-        help="Texture database, a folder or a name of `database list`; else the procedural skins.",
-    ),
-]
-FeaturesOption = Annotated[
-    str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")
-]
-IterationsOption = Annotated[
-    int, typer.Option("--iterations", help="Steps of the synthesis over all resolutions.")
-]
+
+_SOURCES = {name: options.TEXTURE[name] for name in ("database", "features")}
 
 
+@with_options(CompletionOptions, "completion", options.COMPLETION)
+@with_options(DigitizeOptions, "sources", _SOURCES)
 def texture(
     out: Annotated[Path, typer.Argument(help="Folder that `jaxface digitize` or `fit` wrote.")],
-    database: DatabaseOption = None,
-    features: FeaturesOption = "random",
+    sources: Mapping[str, Any],
+    completion: Mapping[str, Any],
     resolution: Annotated[
         int | None, typer.Option("--resolution", help="Texels along a side; as the partial albedo.")
     ] = None,
-    alpha: Annotated[float, typer.Option("--alpha", help="Weight of detail, equation 3.")] = 2000,
-    norm: Annotated[
-        str, typer.Option("--norm", help="Of the blend: frobenius (the paper's) or squared.")
-    ] = "frobenius",
-    iterations: IterationsOption = 1000,
-    detail: Annotated[
-        str | None,
-        typer.Option("--detail", help="Detail by region from 0 to 1, as lips=0.5,nose=1."),
-    ] = None,
-    keep_photo: Annotated[
-        float,
-        typer.Option("--keep-photo", help="Weight of what the photo shows; 0 as in the paper."),
-    ] = 30.0,
-    start: Annotated[
-        str, typer.Option("--start", help="neighbour, or low_frequency as in the paper.")
-    ] = "neighbour",
     model: Annotated[
         Path | None, typer.Option("--model", help="Model file, where it is not a bundled one.")
     ] = None,
+    as_published: options.AsPublished = False,
 ) -> None:
     """Complete the albedo of a digitized photo: analysis, blending, synthesis."""
-    from jaxface.pipeline.texture.folder import complete_folder
-    from jaxface.pipeline.texture.options import CompletionOptions, parse_detail
+    from jaxface.pipeline import complete_folder
 
     with errors(), steps(f"texture of {out}") as on_step:
-        settings = CompletionOptions(
-            alpha=alpha, norm=norm, iterations=iterations, start=start,
-            detail=parse_detail(detail) if detail else {}, keep_photo=keep_photo,
-        )  # fmt: skip
+        asked = CompletionOptions.as_published() if as_published else CompletionOptions()
         done = complete_folder(
-            out, database=database, features=features, resolution=resolution, options=settings,
-            model=model, on_step=on_step,
+            out, **sources, resolution=resolution, model=model, on_step=on_step,
+            options=changed(asked, options.COMPLETION, completion),
         )  # fmt: skip
     console.print(
         f"{(done.blended.weights > 0).sum()} subjects blended, relative gap "
         f"{float(done.blended.relative_gap):.1e}; wrote [bold]{out / 'albedo.png'}[/bold]"
     )
+    if done.compared_by == "cache":
+        console.print("compared by the statistics that `jaxface database precompute` keeps")
 
 
 @database_app.command("list")
@@ -217,7 +196,9 @@ def database_build(
 @database_app.command("precompute")
 def database_precompute(
     path: Annotated[Path, typer.Argument(help="Folder of a database.")],
-    features: FeaturesOption = "random",
+    features: Annotated[
+        str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")
+    ] = DigitizeOptions.features,
     resolution: Annotated[
         int | None,
         typer.Option("--resolution", help="Texels along a side; as photos are compared at."),

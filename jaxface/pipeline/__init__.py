@@ -4,24 +4,33 @@ Each step is a function of its own and can be replaced: give landmarks, a mask, 
 of your own, or call the stages yourself.
 """
 
-from jaxface.pipeline._digitize import digitize, open_photo
+from jaxface.pipeline._digitize import digitize
 from jaxface.pipeline.cluster import digitize_on_cluster
 from jaxface.pipeline.fitting._detail_levels import detail_levels
 from jaxface.pipeline.fitting._fit import as_photo, fit
 from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.fitting.outputs import save_fit
 from jaxface.pipeline.folder import FolderEntry, digitize_folder, photos_in, shard_of
-from jaxface.pipeline.texture.partial import Texture, texture
+from jaxface.pipeline.options import DigitizeOptions
+from jaxface.pipeline.photo import open_photo
+from jaxface.pipeline.texture._complete import complete
+from jaxface.pipeline.texture.folder import complete_folder
+from jaxface.pipeline.texture.options import CompletionOptions
+from jaxface.pipeline.texture.partial import Texture
 from jaxface.run.clock import Clock
 from jaxface.stages.fit.options import FitOptions
 
 __all__ = [
     "Clock",
+    "CompletionOptions",
+    "DigitizeOptions",
     "FitOptions",
     "FittedFace",
     "FolderEntry",
     "Texture",
     "as_photo",
+    "complete",
+    "complete_folder",
     "detail_levels",
     "digitize",
     "digitize_folder",
@@ -31,5 +40,4 @@ __all__ = [
     "photos_in",
     "save_fit",
     "shard_of",
-    "texture",
 ]

@@ -1,10 +1,10 @@
 """The whole journey: a photo in, a folder of results out."""
 
+import dataclasses
 import os
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, Unpack
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from jaxface.io.face_models import load_model
 from jaxface.io.formats.image import Photo
 from jaxface.io.formats.landmark_file import read_landmarks
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.fitting._fit import FittedFace, as_photo, fit
+from jaxface.pipeline.fitting._fit import FittedFace, fit
 from jaxface.pipeline.fitting.outputs import save_fit
+from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
+from jaxface.pipeline.photo import DEMO, open_photo, read_mask
 from jaxface.pipeline.texture.folder import (
     PAINTED_MODEL,
     CompletionInputs,
@@ -25,128 +27,103 @@ from jaxface.pipeline.texture.folder import (
 from jaxface.pipeline.texture.partial import texture
 from jaxface.run.clock import Clock
 
-DEMO = "demo"
-
-
-def demo_photo() -> Photo:
-    """Scikit-image's portrait of Eileen Collins (NASA, public domain)."""
-    from skimage import data
-
-    return as_photo(data.astronaut())
-
-
-def open_photo(photo: str | os.PathLike[str]) -> Photo:
-    """A photo by path, or the demo by its name."""
-    return demo_photo() if str(photo) == DEMO else as_photo(photo)
-
-
-def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
-    """A mask image as (h, w) values from 0 (not face) to 1 (face)."""
-    return as_photo(path).pixels.mean(axis=-1)
-
 
 def digitize(
     photo: str | os.PathLike[str] | Photo | np.ndarray,
     out: str | os.PathLike[str],
+    options: DigitizeOptions | None = None,
     *,
-    resolution: int = 2048,
-    with_texture: bool = True,
-    complete: bool = False,
-    completion: Mapping[str, Any] | None = None,
     on_step: OnStep = silent,
     title: str | None = None,
-    landmarks_file: str | os.PathLike[str] | None = None,
-    mask_file: str | os.PathLike[str] | None = None,
-    **options: Any,
+    **overrides: Unpack[DigitizeOverrides],
 ) -> FittedFace:
-    """Fit a photo, take its albedo, and write everything into ``out``.
+    """Fit a photo, take its albedo and complete it, and write everything into ``out``.
 
     Args:
         photo: path, ``"demo"``, or array.
         out: folder.
-        resolution: of the texture, texels along a side.
-        with_texture: take the albedo from the photo.
-        complete: complete the albedo, by `complete_folder`; only with ``with_texture``.
-        completion: its options.
+        options: the settings; `DigitizeOptions` says what there is, `DigitizeOptions()` being the
+            default.
         on_step: told of the steps of the completion.
         title: name for the report; the file's by default.
-        landmarks_file: points to use instead of detection.
-        mask_file: image of the photo's size, white on skin.
-        options: passed to ``fit``.
+        overrides: single settings, by their names in ``options``, as ``resolution=1024``.
 
     Raises:
+        TypeError: an override that is no setting.
         ValueError: as ``fit``, or no completion can be as it is asked for (before the fit).
         FileNotFoundError: a file that does not exist.
     """
-    options["model"] = model = _loaded(options)
-    inputs = None
-    if complete and with_texture:
-        inputs = _completion_inputs(model, resolution, completion or {})
-    return _digitize(
-        photo, out, completion or {}, inputs, resolution=resolution, with_texture=with_texture,
-        on_step=on_step, title=title, landmarks_file=landmarks_file, mask_file=mask_file,
-        **options,
-    )  # fmt: skip
+    opened = open_digitize(dataclasses.replace(options or DigitizeOptions(), **overrides))
+    return digitize_opened(photo, out, opened, on_step=on_step, title=title)
 
 
-def _digitize(
-    photo: str | os.PathLike[str] | Photo | np.ndarray,
-    out: str | os.PathLike[str],
-    completion: Mapping[str, Any],
-    inputs: CompletionInputs | None,
-    *,
-    resolution: int = 2048,
-    with_texture: bool = True,
-    on_step: OnStep = silent,
-    title: str | None = None,
-    landmarks_file: str | os.PathLike[str] | None = None,
-    mask_file: str | os.PathLike[str] | None = None,
-    **options: Any,
-) -> FittedFace:
-    if isinstance(photo, str | os.PathLike):
-        title = title or (DEMO if str(photo) == DEMO else Path(photo).stem)
-        photo = open_photo(photo)
-    if landmarks_file is not None:
-        options["landmarks"] = read_landmarks(landmarks_file).points
-    if mask_file is not None:
-        options["mask"] = read_mask(mask_file)
-    clock = Clock()
-    fitted = fit(photo, clock=clock, **options)
-    textured = texture(fitted, resolution, clock=clock) if with_texture else None
-    save_fit(fitted, out, textured=textured, title=title or "photo", clock=clock)
-    del textured
-    if inputs is not None:
-        complete_folder(out, on_step=on_step, **_resources(options["model"], completion, inputs))
-    return fitted
+class Opened(NamedTuple):
+    """Settings of a journey, and what they name, opened once.
+
+    Attributes:
+        options: the settings.
+        model: the morphable model.
+        completion: what a completion needs; None where there is none.
+    """
+
+    options: DigitizeOptions
+    model: MorphableModel
+    completion: CompletionInputs | None
 
 
-def _resources(
-    model: MorphableModel, completion: Mapping[str, Any], inputs: CompletionInputs
-) -> dict[str, Any]:
-    return {"model": model, **completion, "database": inputs.database, "features": inputs.network}
-
-
-def _loaded(options: Mapping[str, Any]) -> MorphableModel:
-    model = options.get("model", PAINTED_MODEL)
-    return model if isinstance(model, MorphableModel) else load_model(model)
-
-
-def _completion_inputs(
-    model: MorphableModel, resolution: int, completion: Mapping[str, Any]
-) -> CompletionInputs | None:
-    """What a completion after the fit needs, opened before hours are spent; None if none can be.
+def open_digitize(options: DigitizeOptions) -> Opened:
+    """Open the model, and what a completion needs, before hours are spent.
 
     Raises:
-        ValueError: as `open_inputs`.
-        FileNotFoundError: likewise.
+        ValueError: a file is damaged, or no completion can be as it is asked for.
+        FileNotFoundError: a file does not exist.
     """
-    database = completion.get("database")
-    if model.name != PAINTED_MODEL and database is None:
+    model = options.model
+    model = model if isinstance(model, MorphableModel) else load_model(model)
+    if not (options.complete and options.with_texture):
+        return Opened(options, model, None)
+    if model.name != PAINTED_MODEL and options.database is None:
         warnings.warn(
             f"the albedo is left partial: the procedural skins are painted for {PAINTED_MODEL!r}, "
             f"and no database in the UVs of {model.name!r} is named",
             stacklevel=3,
         )
-        return None
-    side = completion.get("resolution") or resolution
-    return open_inputs(model, side, database, completion.get("features", "random"))
+        return Opened(options, model, None)
+    inputs = open_inputs(model, options.resolution, options.database, options.features)
+    return Opened(options, model, inputs)
+
+
+def digitize_opened(
+    photo: str | os.PathLike[str] | Photo | np.ndarray,
+    out: str | os.PathLike[str],
+    opened: Opened,
+    *,
+    on_step: OnStep = silent,
+    title: str | None = None,
+) -> FittedFace:
+    """As `digitize`, for many photos with the same settings."""
+    if isinstance(photo, str | os.PathLike):
+        title = title or (DEMO if str(photo) == DEMO else Path(photo).stem)
+        photo = open_photo(photo)
+    options, clock = opened.options, Clock()
+    fitted = fit(
+        photo, opened.model, options.fit, clock=clock,
+        landmarks=None if options.landmarks is None else read_landmarks(options.landmarks).points,
+        mask=None if options.mask is None else read_mask(options.mask),
+    )  # fmt: skip
+    textured = texture(fitted, options.resolution, clock=clock) if options.with_texture else None
+    save_fit(fitted, out, textured=textured, title=title or "photo", clock=clock)
+    del textured
+    complete_opened(out, opened, on_step=on_step)
+    return fitted
+
+
+def complete_opened(
+    out: str | os.PathLike[str], opened: Opened, *, on_step: OnStep = silent
+) -> None:
+    """Complete the albedo of a folder that is fitted already, if a completion is asked for."""
+    if opened.completion is not None:
+        complete_folder(
+            out, database=opened.completion.database, features=opened.completion.network,
+            options=opened.options.completion, model=opened.model, on_step=on_step,
+        )  # fmt: skip

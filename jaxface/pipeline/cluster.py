@@ -5,6 +5,7 @@ lie on a file system that all share; what they keep between runs is each machine
 one that is shared too.
 """
 
+import dataclasses
 import functools
 import importlib
 import os
@@ -12,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, Unpack
 
 from jaxface.pipeline.folder import (
     FolderEntry,
@@ -22,6 +23,7 @@ from jaxface.pipeline.folder import (
     folders_of,
     reason,
 )
+from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
 from jaxface.run.compile_cache import enable_compilation_cache
 
 EXTRA = "cluster"
@@ -32,7 +34,11 @@ _one_at_a_time = Lock()
 
 
 def digitize_on_cluster(
-    photos: Sequence[Path], out: str | os.PathLike[str], scheduler: str, **options: Any
+    photos: Sequence[Path],
+    out: str | os.PathLike[str],
+    scheduler: str,
+    options: DigitizeOptions | None = None,
+    **overrides: Unpack[DigitizeOverrides],
 ) -> Iterator[FolderEntry]:
     """As `digitize_folder`, over the workers of a scheduler; entries come as photos are done.
 
@@ -44,7 +50,8 @@ def digitize_on_cluster(
         photos: files with different stems.
         out: folder.
         scheduler: its address, as ``tcp://host:8786``, or the ``.json`` file it has written.
-        options: passed to ``digitize``; the model by its name or file.
+        options: the settings, as of ``digitize``; the model by its name or file.
+        overrides: single settings, by their names in ``options``.
 
     Raises:
         ModuleNotFoundError: `distributed` is not installed.
@@ -52,7 +59,8 @@ def digitize_on_cluster(
         FileNotFoundError: as `digitize_folder`, or there is no such ``.json``.
     """
     _distributed()
-    work = Journey(options).elsewhere().prepared()
+    asked = dataclasses.replace(options or DigitizeOptions(), **overrides)
+    work = Journey(asked).elsewhere().prepared()
     yield from run_on_cluster(photos, out, scheduler, work)
 
 

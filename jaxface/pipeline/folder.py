@@ -1,31 +1,27 @@
 """A folder of photos in, a folder of results for each out; alone or side by side with others."""
 
+import dataclasses
 import os
 import re
 import traceback
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, Unpack
 
 from jaxface.io.face_models.model_file import bundled_models
 from jaxface.io.feature_weights import NAMES
 from jaxface.io.file_lock import claimed
 from jaxface.pipeline import _digitize as one
 from jaxface.pipeline.fitting._fit import FittedFace
-from jaxface.pipeline.texture.folder import (
-    WORK_FOLDER,
-    CompletionInputs,
-    OnStep,
-    complete_folder,
-    silent,
-)
+from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
+from jaxface.pipeline.texture.folder import WORK_FOLDER, OnStep, silent
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr")
 LOCKS = ".locks"
 """folder, among the results, of the locks of the photos that are worked on"""
 
-PATHS = ("model", "landmarks_file", "mask_file", "database", "features")
+PATHS = ("model", "landmarks", "mask", "database", "features")
 """options that may be paths"""
 
 
@@ -116,10 +112,11 @@ def folders_of(photos: Sequence[Path], out: str | os.PathLike[str]) -> list[Path
 def digitize_folder(
     photos: Sequence[Path],
     out: str | os.PathLike[str],
+    options: DigitizeOptions | None = None,
     *,
     on_start: Callable[[Path], None] = lambda photo: None,
     on_step: OnStep = silent,
-    **options: Any,
+    **overrides: Unpack[DigitizeOverrides],
 ) -> Iterator[FolderEntry]:
     """Digitize photos one after the other into folders of ``out`` named after them.
 
@@ -132,15 +129,17 @@ def digitize_folder(
     Args:
         photos: files with different stems; of many processes each may be given its `shard_of` them.
         out: folder.
+        options: the settings, as of ``digitize``.
         on_start: called before each photo that is not done yet.
         on_step: told of the steps of each completion.
-        options: passed to ``digitize``.
+        overrides: single settings, by their names in ``options``.
 
     Raises:
         ValueError: two photos would share a folder, or no completion can be as it is asked for.
         FileNotFoundError: there is no such model, database or file of weights.
     """
-    yield from run_folder(photos, out, Journey(options).prepared(), on_start, on_step)
+    asked = dataclasses.replace(options or DigitizeOptions(), **overrides)
+    yield from run_folder(photos, out, Journey(asked).prepared(), on_start, on_step)
 
 
 def run_folder(
@@ -194,27 +193,27 @@ def reason(error: BaseException) -> str:
 
 
 class Journey:
-    """The whole journey of a photo with given options; all that is known of these is here.
+    """The whole journey of a photo with given settings; all that is known of these is here.
 
     Attributes:
         options: as ``digitize`` takes them.
     """
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        self.options = dict(options)
-        self._ready: tuple[dict[str, Any], dict[str, Any], CompletionInputs | None] | None = None
+    def __init__(self, options: DigitizeOptions) -> None:
+        self.options = options
+        self._opened: one.Opened | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"options": self.options, "_ready": None}  # what is loaded stays where it is
+        return {"options": self.options, "_opened": None}  # what is loaded stays where it is
 
     def prepared(self) -> "Journey":
-        """Load the model and check the options, which the first photo does otherwise.
+        """Load the model and check the settings, which the first photo does otherwise.
 
         Raises:
             ValueError: no completion can be as it is asked for.
             FileNotFoundError: there is no such model, database or file of weights.
         """
-        self._prepare()
+        self._open()
         return self
 
     def elsewhere(self) -> "Journey":
@@ -223,52 +222,42 @@ class Journey:
         Raises:
             ValueError: the model is in memory alone.
         """
-        options, completion = self.options, self.options.get("completion") or {}
-        if "model" in options and not isinstance(options["model"], str | os.PathLike):
+        model = self.options.model
+        if not isinstance(model, str | os.PathLike):
             raise ValueError(
-                f"model is a {type(options['model']).__name__} in memory; for other machines give "
-                "its name, or the path of a file (save_model writes one)"
+                f"model is a {type(model).__name__} in memory; for other machines give its name, "
+                "or the path of a file (save_model writes one)"
             )
-        return Journey({**_absolute(options), "completion": _absolute(completion)})
+        return Journey(_absolute(self.options))
 
     def is_done(self, out: Path) -> bool:
         """Whether the report is there, and the complete albedo where one is asked for."""
-        _, _, inputs = self._prepare()
         if not (out / "report.json").is_file():
             return False
         complete = (out / "albedo.png").is_file() and not (out / WORK_FOLDER).exists()
-        return complete or inputs is None
+        return complete or self._open().completion is None
 
     def __call__(self, photo: Path, out: Path, on_step: OnStep) -> FittedFace | None:
         """Fit and complete, or complete what is fitted; raises as ``digitize``."""
-        options, completion, inputs = self._prepare()
         if not (out / "report.json").is_file():
-            return one._digitize(photo, out, completion, inputs, on_step=on_step, **options)
-        if inputs is not None:
-            given = one._resources(options["model"], completion, inputs)
-            complete_folder(out, on_step=on_step, **given)
+            return one.digitize_opened(photo, out, self._open(), on_step=on_step)
+        one.complete_opened(out, self._open(), on_step=on_step)
         return None
 
-    def _prepare(self) -> tuple[dict[str, Any], dict[str, Any], CompletionInputs | None]:
-        if self._ready is None:
-            options = dict(self.options)
-            completion = dict(options.pop("completion", None) or {})
-            complete = options.pop("complete", False) and options.get("with_texture", True)
-            options["model"] = model = one._loaded(options)
-            side = options.get("resolution", 2048)
-            inputs = one._completion_inputs(model, side, completion) if complete else None
-            self._ready = options, completion, inputs
-        return self._ready
+    def _open(self) -> one.Opened:
+        if self._opened is None:
+            self._opened = one.open_digitize(self.options)
+        return self._opened
 
 
-def _absolute(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options with those that are paths of something from the root on; names stay names."""
-    names, found = {*NAMES, *bundled_models()}, dict(options)
+def _absolute(options: DigitizeOptions) -> DigitizeOptions:
+    """Settings with those that are paths of something from the root on; names stay names."""
+    names, found = {*NAMES, *bundled_models()}, {}
     for key in PATHS:
-        value = found.get(key)
+        value = getattr(options, key)
         if value is not None and str(value) not in names and Path(value).exists():
             found[key] = str(Path(value).absolute())
-    return found
+    return dataclasses.replace(options, **found)
 
 
 def _order(photo: Path) -> str:

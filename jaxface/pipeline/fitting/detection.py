@@ -10,7 +10,7 @@ from jaxface.io.formats.image import write_png
 from jaxface.io.formats.landmark_file import Landmarks, write_landmarks
 from jaxface.io.pictures.drawing import draw_landmarks
 from jaxface.models.landmark_schemes import SCHEME_SIZES, landmarks68
-from jaxface.pipeline._digitize import open_photo
+from jaxface.pipeline.photo import open_photo
 from jaxface.stages.landmarks import NoFaceError, detect_faces
 
 

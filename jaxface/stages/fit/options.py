@@ -48,18 +48,26 @@ class FitOptions:
         ValueError: a value that does not fit; the message says which and what is needed.
     """
 
-    steps: Sequence[int] = FitConfig.steps
+    steps: Sequence[int] = field(
+        default=FitConfig.steps, metadata={"help": "Steps on each pyramid level, coarsest first."}
+    )
     """Gauss-Newton steps on each pyramid level, coarsest first"""
-    size: int = WORKING_SIZE
+    size: int = field(default=WORKING_SIZE, metadata={"help": "Side of the working image, px."})
     """side of the working image, px; halved for each coarser level"""
     weights: FitWeights = field(default_factory=FitWeights)
     """of the terms"""
-    details: Sequence[int] | None = None
+    details: Sequence[int] | None = field(
+        default=None, metadata={"help": "Subdivisions of the model at each level, as 0,1,2."}
+    )
     """subdivisions of the model at each level; None: by its number of vertices
     (``detail_levels``)"""
-    face: int | None = None
+    face: int | None = field(
+        default=None, metadata={"help": "Which face, from the largest (0), if there are several."}
+    )
     """which face, from the largest (0), where the photo shows several"""
-    focal: float | None = None
+    focal: float | None = field(
+        default=None, metadata={"help": "Focal length that is known, mm for a frame 36 mm wide."}
+    )
     """focal length that is known, as of a lens for 35 mm film: mm for a frame 36 mm wide. It is
     held. For one in pixels of the photo give ``36 * pixels / max(width, height)``. None: the
     photo's file, or else a normal lens, is the middle of a weak prior"""
@@ -69,7 +77,12 @@ class FitOptions:
     extra_terms: Sequence[Term] = ()
     """your own terms, functions of ``(FaceParameters, FitData)``; weights that are numbers are data
     of the compiled program, so that another needs no other"""
-    self_shadow: bool = True
+    self_shadow: bool = field(
+        default=True,
+        metadata={
+            "help": "Shade with what the face hides from itself of the light, or as the paper."
+        },
+    )
     """whether the shading lacks what the face hides from itself of the light
     (``render.occlusion``, of the mean face)"""
     shadow_directions: int = FitConfig.shadow_directions
