@@ -46,7 +46,7 @@ def digitize_photos(
                 entries = digitize_on_cluster(photos, out, scheduler, **options)
             else:
                 entries = digitize_folder(
-                    photos, out, on_start=lambda photo: tell(photo.name, "begun"), on_step=on_step,
+                    photos, out, on_start=lambda photo: on_step.say(photo.name), on_step=on_step,
                     **options,
                 )  # fmt: skip
             for number, entry in enumerate(entries, 1):
