@@ -109,7 +109,7 @@ def fitted(monkeypatch):
     """Names of the photos that are fitted, by a stand-in that writes a report alone."""
     names = []
 
-    def stand_in(photo, out, completion, completing, *, on_step, **options):
+    def stand_in(photo, out, opened, *, on_step):
         names.append(photo.name)
         if photo.read_bytes() == b"broken":
             raise ValueError("no face [in] it")
@@ -117,7 +117,7 @@ def fitted(monkeypatch):
         out.mkdir(parents=True)
         (out / "report.json").write_text("{}")
 
-    monkeypatch.setattr("jaxface.pipeline._digitize._digitize", stand_in)
+    monkeypatch.setattr("jaxface.pipeline._digitize.digitize_opened", stand_in)
     return names
 
 

@@ -42,7 +42,7 @@ def test_lines_come_at_the_start_at_the_end_and_every_few_seconds_between(clock)
     told = []
     lines = ProgressLines(told.append, clock, line_every=5.0)
     for done in range(1, 101):
-        lines.move("skins", done, 100)
+        lines("skins", done, 100)
         clock.now += 0.3
     assert told[0] == "0:00:00 skins 1/100" and told[-1] == "0:00:29 skins 100/100"
     assert told[1:-1] == [f"0:00:{t:02d} skins {n}/100" for t, n in [
@@ -56,9 +56,9 @@ def test_each_kind_of_work_begins_and_ends_with_a_line(clock):
     clock.now += 3671
     for what in ("compare", "synthesis [256]"):
         for done in (1, 2, 3):
-            lines.move(what, done, 3)
-        lines.move(what, 3, 3)
-    lines.move("compare", 1, 3)  # the next photo's
+            lines(what, done, 3)
+        lines(what, 3, 3)
+    lines("compare", 1, 3)  # the next photo's
     assert told == [
         "1:01:11 compare 1/3", "1:01:11 compare 3/3", "1:01:11 synthesis [256] 1/3",
         "1:01:11 synthesis [256] 3/3", "1:01:11 compare 1/3",
@@ -73,11 +73,11 @@ def test_silence_is_broken_by_what_is_being_done(clock):
         clock.now += 1
         lines.beat()
     assert told == ["0:00:00 demo", "0:00:20 demo ...", "0:00:40 demo ..."]
-    lines.move("skins", 1, 2)
+    lines("skins", 1, 2)
     for _ in range(3):
         clock.now += 15
         lines.beat()
-    lines.move("skins", 2, 2)
+    lines("skins", 2, 2)
     clock.now += 20
     lines.beat()
     assert told[3:] == [
@@ -138,9 +138,16 @@ def test_a_terminal_gets_bars(monkeypatch):
     with steps("photo [1]") as move:
         move("compare", 1, 4)
         move("compare", 4, 4)
+        move.say("b.png [2]")
         move("compare", 2, 4)
     text = screen.getvalue()
-    assert "photo [1]" in text and "compare" in text and "2/4" in text and "\x1b[" in text
+    assert (
+        "photo [1]" in text
+        and "b.png [2]" in text
+        and "compare" in text
+        and "2/4" in text
+        and "\x1b[" in text
+    )
     with progress("import"):
         pass
     assert "import" in screen.getvalue() and "import: done" not in screen.getvalue()

@@ -1,9 +1,9 @@
 """What the commands show: progress while they work, errors in one line."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 import typer
 from rich.console import Console
@@ -13,6 +13,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
 )
@@ -30,15 +31,27 @@ def progress(text: str) -> Iterator[None]:
         yield
 
 
+class Steps(Protocol):
+    """Progress that is shown."""
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        """News of a kind of work."""
+        ...
+
+    def say(self, text: str) -> None:
+        """What is being done now."""
+        ...
+
+
 @contextmanager
-def steps(text: str) -> Iterator[Callable[[str, int, int], None]]:
+def steps(text: str) -> Iterator[Steps]:
     """Progress of each kind of work, moved by ``(what, done, of)``.
 
     On a terminal a bar for each and a spinner beside the text; elsewhere, in a log or a job queue,
     `ProgressLines`.
     """
-    with _bars(text) if _is_live() else _lines(text) as move:
-        yield move
+    with _bars(text) if _is_live() else _lines(text) as shown:
+        yield shown
 
 
 def _is_live() -> bool:
@@ -54,31 +67,43 @@ def _spinner(text: str) -> Iterator[None]:
         yield
 
 
+class _Bars:
+    def __init__(self, shown: Progress, text: str) -> None:
+        self._shown, self._text = shown, text
+        self._whole = shown.add_task(escape(text), total=None)
+        self._tasks: dict[str, TaskID] = {}
+        self._done: dict[str, int] = {}
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        if what not in self._tasks:
+            self._tasks[what] = self._shown.add_task(escape(what), total=of)
+        elif done < self._done[what]:  # the next photo's
+            self._shown.reset(self._tasks[what])
+        self._done[what] = done
+        self._shown.update(self._tasks[what], completed=done, total=of)
+
+    def say(self, text: str) -> None:
+        self._shown.update(self._whole, description=escape(f"{self._text}: {text}"))
+
+    def end(self) -> None:
+        self._shown.update(self._whole, description=escape(self._text), total=1, completed=1)
+
+
 @contextmanager
-def _bars(text: str) -> Iterator[Callable[[str, int, int], None]]:
+def _bars(text: str) -> Iterator[Steps]:
     columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, TimeElapsedColumn(), console=console) as shown:
-        tasks = {text: shown.add_task(escape(text), total=None)}
-        begun: dict[str, int] = {}
-
-        def move(what: str, done: int, of: int) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(escape(what), total=of)
-            elif done < begun.get(what, 0):  # the next photo's
-                shown.reset(tasks[what])
-            begun[what] = done
-            shown.update(tasks[what], completed=done, total=of)
-
-        yield move
-        shown.update(tasks[text], total=1, completed=1)
+        bars = _Bars(shown, text)
+        yield bars
+        bars.end()
 
 
 @contextmanager
-def _lines(text: str) -> Iterator[Callable[[str, int, int], None]]:
+def _lines(text: str) -> Iterator[Steps]:
     lines = ProgressLines(lambda line: console.print(line, markup=False, **_AS_IT_IS))
     lines.say(text)
     with beating(lines):
-        yield lines.move
+        yield lines
     lines.say(f"{text}: done")
 
 

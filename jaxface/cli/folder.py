@@ -48,7 +48,7 @@ def digitize_photos(
             else:
                 entries = digitize_folder(
                     photos, out, asked,
-                    on_start=lambda photo: tell(photo.name, "begun"), on_step=on_step,
+                    on_start=lambda photo: on_step.say(photo.name), on_step=on_step,
                 )  # fmt: skip
             for number, entry in enumerate(entries, 1):
                 found[entry.state] += 1

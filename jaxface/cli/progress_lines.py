@@ -48,7 +48,7 @@ class ProgressLines:
             self._doing = text
             self._line(text)
 
-    def move(self, what: str, done: int, of: int) -> None:
+    def __call__(self, what: str, done: int, of: int) -> None:
         """News of a kind of work; one that falls back has begun anew."""
         with self._lock:
             before = self._done.get(what)
