@@ -33,22 +33,29 @@ def scene(photos=4, vertices=400, outliers=0.0):
     return seen, jnp.asarray(mean, jnp.float32), jnp.asarray(basis, jnp.float32), light, gains
 
 
-@pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_light_and_gains_are_found(outliers):
+@pytest.mark.parametrize(
+    # Measured: 2.2e-4 and 0.0044; with outliers 5.6e-4 and 0.0065.
+    ("outliers", "gain_error", "misfit"),
+    [(0.0, 4e-4, 0.007), (0.1, 1e-3, 0.010)],
+)
+def test_light_and_gains_are_found(outliers, gain_error, misfit):
+    """Up to the ridge that holds what half a sphere of normals leaves open."""
     seen, mean, basis, light, gains = scene(outliers=outliers)
     found = common_light(seen, mean, basis)
-    np.testing.assert_allclose(found.gains, gains, rtol=0.05)
+    np.testing.assert_allclose(found.gains, gains, rtol=gain_error)
     visible = np.asarray(seen.harmonics[0])
     ours, true = visible @ np.asarray(found.light), visible @ light
-    assert np.median(np.abs(ours - true) / true) < 0.05
-    assert float(found.misfit.max()) < 0.05
+    assert np.median(np.abs(ours - true) / true) < 0.005  # 0.0031 measured
+    assert np.max(np.abs(ours - true) / true) < 0.07  # 0.044
+    assert float(found.misfit.max()) < misfit
 
 
 def test_a_known_light_is_kept():
     seen, mean, basis, light, gains = scene()
     found = common_light(seen, mean, basis, light=jnp.asarray(light, jnp.float32))
     np.testing.assert_allclose(found.light, light, rtol=1e-6)
-    np.testing.assert_allclose(found.gains, gains, rtol=0.03)
+    np.testing.assert_allclose(found.gains, gains, rtol=1e-3)  # 6e-4 measured
+    assert float(found.misfit.max()) < 0.005  # 0.0031: of the albedo's prior
 
 
 def test_wrong_shapes_are_named():

@@ -1,5 +1,7 @@
 """fit.npz: round trip, and what is refused."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,16 @@ def test_truncated_foreign_and_missing(tmp_path):
 
 
 def test_pickles_are_refused(tmp_path):
-    np.savez(tmp_path / "evil.npz", identity=np.array([{"a": 1}], dtype=object))
+    """In a file that is whole but for the pickle, which would make a folder if it were opened."""
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "made"),)
+
+    write_fit(tmp_path / "fit.npz", _parameters(), {}, {})
+    with np.load(tmp_path / "fit.npz") as stored:
+        arrays = dict(stored)
+    np.savez(tmp_path / "evil.npz", landmarks=np.array([Evil()], dtype=object), **arrays)
     with pytest.raises(ValueError, match="evil.npz"):
         read_fit(tmp_path / "evil.npz")
+    assert not (tmp_path / "made").exists()

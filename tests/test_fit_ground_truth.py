@@ -109,12 +109,20 @@ def test_a_fit_from_detected_landmarks_finds_the_face(face, model, fine):
     photo, truth = face
     estimate = fit_photo(photo, model)
     figures = compare(estimate, truth, fine, face_region(fine))
-    assert figures["median"] < 1.2
-    assert figures["ratio"] < 0.6
-    assert figures["albedo"] < figures["mean_albedo"]
-    assert figures["light"] < 0.5 * figures["ambient_light"]
-    assert figures["landmarks_fit_to_detected"] < 2.5
-    assert figures["identity_rms"] < 1.5
+    # Measured, from the front and turned by 25 degrees: 0.35, 0.65 mm; 0.23, 0.32 of the mean
+    # face's distance; albedo 0.007, 0.020 (mean albedo: 0.091, 0.068); light 0.023, 0.045
+    # (ambient: 0.21, 0.18); landmarks 1.7, 2.0 and 0.27, 0.63 % of the eyes' distance; rotation
+    # 0.64, 0.61 degrees; coefficients 0.73, 0.89 deviations.
+    turned = truth["rotation"][2, 0] ** 2 > 0.05
+    assert figures["median"] < (1.0 if turned else 0.6)
+    assert figures["ratio"] < (0.5 if turned else 0.4)
+    assert figures["albedo"] < (0.035 if turned else 0.014)
+    assert figures["albedo"] < 0.5 * figures["mean_albedo"]
+    assert figures["light"] < (0.08 if turned else 0.045)
+    assert figures["landmarks_fit_to_detected"] < 2.6
+    assert figures["landmarks_fit_to_true"] < (1.1 if turned else 0.5)
+    assert figures["rotation"] < 1.2
+    assert figures["identity_rms"] < 1.3
 
 
 def test_alignment_ignores_a_similarity_and_nothing_else():

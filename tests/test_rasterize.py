@@ -116,7 +116,6 @@ def test_equals_brute_force_in_single_precision_away_from_ties(seed):
     ids, weights, depth, clear = brute_force(screen, faces, HEIGHT, WIDTH)
     got = rasterize(jnp.asarray(screen), jnp.asarray(faces), HEIGHT, WIDTH)
     assert clear.mean() > 0.97
-    assert clear.mean() > 0.95
     np.testing.assert_array_equal(np.asarray(got.triangle)[clear], ids[clear])
     np.testing.assert_allclose(np.asarray(got.depth)[clear], depth[clear], rtol=1e-3)
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from jaxface.geometry.camera import Camera, Pose
 from jaxface.imaging.mipmap import mipmap
@@ -15,7 +16,6 @@ HEIGHT, WIDTH = 45, 61
 
 def head():
     """A bumpy closed surface of 320 triangles, millimetres, with a colour at each vertex."""
-    trimesh = pytest.importorskip("trimesh")
     sphere = trimesh.creation.icosphere(subdivisions=2)
     rng = np.random.default_rng(0)
     vertices = np.asarray(sphere.vertices) * [70.0, 95.0, 80.0] + rng.normal(0, 1.5, (162, 3))
