@@ -156,7 +156,7 @@ class _Work:
         sharp = [r for r in self.levels if r <= ANALYSIS and self._texels(r) <= 1.5]
         self.analysis_level = max(sharp, default=self.levels[0])
         self._grams = jax.jit(
-            lambda net, image, tile: grams(net, image, settings.layers, tile),
+            lambda net, image, tile: grams(image, net, layers=settings.layers, tile=tile),
             static_argnums=2,
         )
         # One level's alone: whole maps of every level would add up.
@@ -300,12 +300,12 @@ class _Work:
             self.cut(seen.weight, level) * free,
             self.cut(rgb_to_yiq(seen.low_frequency)[..., 0], level),
             self.cut(self.detail(level), level),
+            jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype),
         )
         goal = self.targets(level, blended, used)
         targets = StyleTargets(goal, alpha=self.settings.alpha)
-        blur = jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype)
         problem = SynthesisProblem(
-            self.network, targets, jnp.asarray(free), known, blur, self.settings.weights
+            self.network, targets, jnp.asarray(free), known, self.settings.weights
         )
         steps = level_steps(self.settings.iterations, len(self.levels))[index]
         what = f"synthesis at {level}"
