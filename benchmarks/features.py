@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from harness import Benchmark, Measurement
 
-from jaxface.energies._gram import StyleTargets, style_value_and_grad
+from jaxface.energies._gram import StyleData, StyleTargets, style_value_and_grad
 from jaxface.networks.texture_features.network import STYLE_LAYERS, prepare_kernels
 from jaxface.networks.texture_features.random_weights import SHAPES, random_network
 from jaxface.run.memory import keep_freed_memory
@@ -46,16 +46,17 @@ def measure(side: int, tile: int | None, calls: int, method: str) -> dict[str, A
     image = jax.random.uniform(jax.random.key(0), (side, side))
     channels = network.channels
     targets = StyleTargets({name: jnp.ones((channels[name],) * 2) for name in STYLE_LAYERS})
-    jax.block_until_ready((network, image, targets))
+    data = StyleData(network, targets)
+    jax.block_until_ready((image, data))
     start = time.perf_counter()
-    run = jax.jit(style_value_and_grad, static_argnums=(3, 4))
-    program = run.lower(network, image, targets, tile, method).compile()
+    run = jax.jit(style_value_and_grad, static_argnames=("tile", "method"))
+    program = run.lower(image, data, tile=tile, method=method).compile()
     compiled = time.perf_counter() - start
     before = resident()
     wall, processor = [], []
     for _ in range(calls):
         start = time.perf_counter(), time.process_time()
-        jax.block_until_ready(program(network, image, targets))
+        jax.block_until_ready(program(image, data))
         wall.append(time.perf_counter() - start[0])
         processor.append(time.process_time() - start[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -202,7 +202,7 @@ def main(
     keep_freed_memory()  # as the command does; both ways gain by it
     bench = Benchmark(name)
     network = load_network(source)
-    direct = jax.jit(lambda n, i, v: grams(n, mask_out(i, v)))
+    direct = jax.jit(lambda n, i, v: grams(mask_out(i, v), n))
     behind = masks(mask or [])
     one_texture(bench, source, network, direct, behind)
     if textures:

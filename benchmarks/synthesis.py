@@ -26,7 +26,7 @@ from held_out_skin import read_skins
 from scipy.ndimage import gaussian_filter
 
 from jaxface._types import Array, Float
-from jaxface.energies._gram import StyleTargets, grams, style_energy
+from jaxface.energies._gram import StyleData, StyleTargets, grams, style_energy
 from jaxface.imaging.colour import rgb_to_yiq
 from jaxface.io.feature_weights import load_network
 from jaxface.networks.texture_features.network import FeatureNetwork, prepare_kernels
@@ -125,10 +125,10 @@ def main() -> None:
             if options.only not in (None, network_name):
                 continue
             network = load_network(network_name)
-            targets = StyleTargets(jax.jit(grams)(network, jnp.asarray(example)))
+            targets = StyleTargets(jax.jit(grams)(jnp.asarray(example), network))
 
             def energy(z: Array, data: tuple[FeatureNetwork, StyleTargets, Array]) -> Array:
-                return style_energy(data[0], changed(data[2], z), data[1])
+                return style_energy(changed(data[2], z), StyleData(data[0], data[1]))
 
             name = f"{network_name}, {options.side} px"
             runs: dict[str, dict[str, Any]] = {}

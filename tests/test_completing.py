@@ -300,7 +300,10 @@ def test_as_published_is_the_paper(model, base, database, network):
     assert done.box == (slice(0, SIZE), slice(0, SIZE)) and len(done.levels) == 1
     np.testing.assert_allclose(done.start, shown["low_frequency"], atol=1e-5)
     # The target is the convex blend of the subjects' own Gram matrices, eq. 2.
-    own = [grams(network, rgb_to_yiq(jnp.asarray(texture))[..., 0], LAYERS) for texture in database]
+    own = [
+        grams(rgb_to_yiq(jnp.asarray(texture))[..., 0], network, layers=LAYERS)
+        for texture in database
+    ]
     for name in LAYERS:
         blended = sum(w * g[name] for w, g in zip(done.blended.weights, own, strict=True))
         np.testing.assert_allclose(done.targets[name], blended, rtol=2e-3, atol=1e-5)

@@ -89,7 +89,7 @@ def test_grams_of_a_batch_are_those_of_each_image(pictures) -> None:
     images = jnp.asarray(crop_pairs(pictures, 2, np.random.default_rng(0))[0])
     found = batch_grams(network, images)
     for index, image in enumerate(images):
-        for name, gram in grams(network, image, method="direct").items():
+        for name, gram in grams(image, network, method="direct").items():
             np.testing.assert_allclose(found[name][index], gram, rtol=1e-4, atol=1e-5)
 
 
@@ -122,7 +122,7 @@ def test_equalised_layers_are_equally_loud_and_tell_the_same(pictures, states) -
 
 def assert_equally_loud(network, tolerance=1e-3) -> None:
     picture = jnp.asarray(natural_noise(128, np.random.default_rng(0)), jnp.float32)
-    for name, gram in grams(network, picture, network.layers, method="direct").items():
+    for name, gram in grams(picture, network, layers=network.layers, method="direct").items():
         assert float(jnp.mean(jnp.diag(gram))) == pytest.approx(1, abs=tolerance), name
 
 

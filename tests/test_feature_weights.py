@@ -75,7 +75,7 @@ def test_real_vgg19_responds_as_in_torch(references, data_dir):
         places = references[f"real/{layer}/places"]
         np.testing.assert_allclose(flat[places], values, atol=2e-4 * scale)
     with pytest.raises(ValueError, match="no weights for conv4_1.*conv1_1 .. conv3_4"):
-        grams(network, picture, ("conv1_1", "conv4_1"))
+        grams(picture, network, layers=("conv1_1", "conv4_1"))
 
 
 def test_lpips_layout_and_digest(tmp_path):

@@ -22,7 +22,9 @@ from jaxface.stages.texture.masked_grams import compressed, layout, masked_grams
 LAYERS = ("conv1_1", "conv2_1", "conv2_2", "conv3_1")
 TOLERANCE = 3e-5  # of 16-bit steps; 2e-5 is reached where one cell's sum is all there is
 SHAPE = ((2, 8), (2, 16), (1, 16))
-direct = jax.jit(lambda network, image, visible: grams(network, mask_out(image, visible), LAYERS))
+direct = jax.jit(
+    lambda network, image, visible: grams(mask_out(image, visible), network, layers=LAYERS)
+)
 
 
 def masks(height: int, width: int) -> dict[str, np.ndarray]:

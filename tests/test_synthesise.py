@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxface.energies._gram import StyleTargets, grams
-from jaxface.energies.known_detail import KnownDetail, known_detail_energy
+from jaxface.energies.known_detail import KnownDetail, photo_detail_energy, plain_detail_energy
 from jaxface.imaging.low_pass import low_pass
 from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.stages.texture._synthesise import (
@@ -42,13 +42,13 @@ def problem_of(network, target, start, *, photo=0.0, weight=None, free=None, det
         zeros if weight is None else weight,
         start,
         jnp.ones_like(start) if detail is None else detail,
+        jnp.asarray(1.0, start.dtype),
     )
     return SynthesisProblem(
         network,
-        StyleTargets(grams(network, target, LAYERS)),
+        StyleTargets(grams(target, network, layers=LAYERS)),
         jnp.ones(start.shape, bool) if free is None else free,
         known,
-        jnp.asarray(1.0, start.dtype),
         SynthesisWeights(photo=photo),
     )
 
@@ -57,7 +57,26 @@ def test_energy_vanishes_on_the_target_itself(network):
     target = texture()
     total, terms = synthesis_energy().value(target, problem_of(network, target, target))
     assert float(total) < 1e-6
-    assert set(terms) == {"style", "known"}
+    assert set(terms) == {"style", "photo", "plain"}
+
+
+def test_each_term_is_reported_with_its_own_weight(network):
+    target, start = texture(16, 0), texture(16, 1)
+    free = jnp.ones((16, 16), bool).at[:, :4].set(False)
+    problem = problem_of(
+        network, target, start, photo=2.0, weight=jnp.ones((16, 16)), free=free,
+        detail=jnp.zeros((16, 16)),
+    )  # fmt: skip
+    image = start + 0.1
+    total, terms = synthesis_energy().value(image, problem)
+    held = jnp.where(free, image, start)
+    plain = SynthesisWeights().plain * plain_detail_energy(held, problem.known)
+    assert float(terms["photo"]) == pytest.approx(
+        2 * float(photo_detail_energy(held, problem.known))
+    )
+    assert float(terms["plain"]) == pytest.approx(float(plain))
+    assert float(plain) == pytest.approx(30 * 0.1**2 * 16 * 12, rel=1e-4)
+    assert float(total) == pytest.approx(sum(float(value) for value in terms.values()))
 
 
 def test_gradient_in_both_modes(network, x64):
@@ -131,20 +150,19 @@ def test_wrong_input_is_told(network):
 def test_known_detail_is_its_definition_and_differentiable_at_rest(x64):
     rng = np.random.default_rng(0)
     photo, weight, low, detail = (jnp.asarray(rng.uniform(size=(9, 11))) for _ in range(4))
-    known = KnownDetail(photo, weight, low, detail)
+    known = KnownDetail(photo, weight, low, detail, 0.0)
     image = jnp.asarray(rng.uniform(size=(9, 11)))
-    expected = 2 * jnp.sum(weight * (weight * (image - photo)) ** 2)
-    expected = expected + 3 * jnp.sum((1 - detail) * (image - low) ** 2)
-    assert float(known_detail_energy(image, known, 0.0, 2.0, 3.0)) == pytest.approx(
-        float(expected), rel=1e-10
-    )
-    check_grads(
-        lambda image, blur: known_detail_energy(image, known, blur), (image, jnp.array(1.2)), 1,
-        ("fwd", "rev"), eps=1e-6,
-    )  # fmt: skip
-    same = KnownDetail(image, weight, image, detail)
-    gradient = jax.grad(lambda i: known_detail_energy(i, same, 1.0))(image)
-    np.testing.assert_allclose(gradient, 0.0, atol=1e-14)
+    held = jnp.sum(weight * (weight * (image - photo)) ** 2)
+    assert float(photo_detail_energy(image, known)) == pytest.approx(float(held), rel=1e-10)
+    plain = jnp.sum((1 - detail) * (image - low) ** 2)
+    assert float(plain_detail_energy(image, known)) == pytest.approx(float(plain), rel=1e-10)
+    same = KnownDetail(image, weight, image, detail, jnp.array(1.2))
+    unseen = KnownDetail(photo, 0 * weight, low, 1 + 0 * detail, jnp.array(1.2))
+    for energy in (photo_detail_energy, plain_detail_energy):
+        for data in (same, unseen):
+            check_grads(energy, (image, data), 1, ("fwd", "rev"), eps=1e-6)
+        gradient = jax.grad(energy)(image, same)
+        np.testing.assert_allclose(gradient, 0.0, atol=1e-14)
 
 
 @settings(deadline=None, max_examples=20)

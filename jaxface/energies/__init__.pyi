@@ -1,6 +1,7 @@
 from ._gram import (
     DETAIL_WEIGHT,
     MASKED,
+    StyleData,
     StyleTargets,
     feature_loss,
     gram,
@@ -16,7 +17,7 @@ from ._photometric_quadratic import (
     photometric_quadratic,
     shape_basis,
 )
-from .known_detail import KnownDetail, known_detail_energy
+from .known_detail import KnownDetail, photo_detail_energy, plain_detail_energy
 from .landmark import LandmarkData, landmark_difference, landmark_residual
 from .photometric import (
     PhotometricData,
@@ -47,6 +48,7 @@ __all__ = [
     "PhotometricData",
     "PixelSamples",
     "Quadratic",
+    "StyleData",
     "StyleTargets",
     "Term",
     "compose",
@@ -55,18 +57,19 @@ __all__ = [
     "gram",
     "gram_loss",
     "grams",
-    "known_detail_energy",
     "landmark_difference",
     "landmark_residual",
     "light_residual",
     "mask_out",
     "normal_modes",
+    "photo_detail_energy",
     "photometric_difference",
     "photometric_energy",
     "photometric_jacobian",
     "photometric_quadratic",
     "photometric_residual",
     "photometric_root_residual",
+    "plain_detail_energy",
     "prior_residual",
     "quadratic_by_autodiff",
     "reweighting",

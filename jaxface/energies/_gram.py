@@ -50,8 +50,9 @@ def mask_out(image: Float[Array, "h w"], visible: Bool[Array, "h w"]) -> Float[A
 
 
 def grams(
-    network: FeatureNetwork,
     image: Float[Array, "h w"],
+    network: FeatureNetwork,
+    *,
     layers: Sequence[str] = STYLE_LAYERS,
     tile: int | None = None,
     method: str = "auto",
@@ -61,8 +62,8 @@ def grams(
     Differentiable in both modes with and without tiles.
 
     Args:
-        network: the weights.
         image: Y of the gamma-encoded texture in [0, 1], already masked out where that is wanted.
+        network: the weights.
         layers: names.
         tile: where given and smaller than the image, it is processed in squares of this side (px,
             a multiple of 16 for layers of block 5) in memory that the tile bounds, with the same
@@ -72,7 +73,7 @@ def grams(
     Raises:
         ValueError: a layer is unknown or empty, the image is not (h, w), the tile does not fit.
     """
-    return _statistics(network, image, tuple(layers), {}, tile, method)[0]
+    return _statistics(image, network, tuple(layers), {}, tile, method)[0]
 
 
 class StyleTargets(eqx.Module):
@@ -86,6 +87,13 @@ class StyleTargets(eqx.Module):
     gram_weights: Mapping[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
     """by layer; 1 where none is given, as in the paper"""
     feature_weights: Mapping[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
+
+
+class StyleData(eqx.Module):
+    """Arguments of the style energy."""
+
+    network: FeatureNetwork
+    targets: StyleTargets
 
 
 def gram_loss(
@@ -133,22 +141,25 @@ def _weighted_distance(
 
 
 def style_energy(
-    network: FeatureNetwork,
-    image: Float[Array, "h w"],
-    targets: StyleTargets,
-    tile: int | None = None,
-    method: str = "auto",
+    image: Float[Array, "h w"], data: StyleData, *, tile: int | None = None, method: str = "auto"
 ) -> Float[Array, ""]:
     """The energy of texture synthesis, eq. 3 of Saito 2017.
 
-    Differentiable in both modes with respect to the image, the targets and the weights, with and
-    without tiles (see ``grams``).
+    Differentiable in both modes with respect to the image, the network, the targets and the
+    weights, with and without tiles (see ``grams``).
+
+    Args:
+        image: Y of the gamma-encoded texture in [0, 1].
+        data: the network, and what its responses are to match.
+        tile: see ``grams``.
+        method: see ``grams``.
 
     Raises:
         ValueError: as ``grams`` does, or a target's shape does not fit.
     """
+    targets = data.targets
     found, distances = _statistics(
-        network, image, tuple(targets.grams), targets.features, tile, method
+        image, data.network, tuple(targets.grams), targets.features, tile, method
     )
     total = targets.alpha * gram_loss(found, targets.grams, targets.gram_weights)
     for name, distance in distances.items():
@@ -157,23 +168,15 @@ def style_energy(
 
 
 def style_value_and_grad(
-    network: FeatureNetwork,
-    image: Float[Array, "h w"],
-    targets: StyleTargets,
-    tile: int | None = None,
-    method: str = "auto",
+    image: Float[Array, "h w"], data: StyleData, *, tile: int | None = None, method: str = "auto"
 ) -> tuple[Float[Array, ""], Float[Array, "h w"]]:
     """``style_energy`` and its gradient with respect to the image."""
-
-    def energy(image: Array) -> Array:
-        return style_energy(network, image, targets, tile, method)
-
-    return jax.value_and_grad(energy)(image)
+    return jax.value_and_grad(style_energy)(image, data, tile=tile, method=method)
 
 
 def _statistics(
-    network: FeatureNetwork,
     image: Float[Array, "h w"],
+    network: FeatureNetwork,
     gram_layers: tuple[str, ...],
     feature_targets: Mapping[str, Float[Array, "hl wl n"]],
     tile: int | None,

@@ -2,6 +2,9 @@
 
 Saito 2017 names as its limitation (section 7) that a mole may appear anywhere, whether it exists
 or not. Where the photo shows the skin, it says where: up to the frequency that the photo holds.
+
+Both are sums of squares that are given as scalars, because their maps weigh each texel: a residual
+would hold the root of a weight, whose derivative at 0, where most maps begin, does not exist.
 """
 
 import equinox as eqx
@@ -21,28 +24,29 @@ class KnownDetail(eqx.Module):
     low_frequency: Float[Array, "h w"]
     detail: Float[Array, "h w"]
     """where detail may go: 1 anywhere, 0 keeps the low frequencies as they are"""
+    blur: Float[Array, ""] | float
+    """standard deviation (texels) of the low-pass beyond which the photo holds nothing"""
 
 
-def known_detail_energy(
-    image: Float[Array, "h w"],
-    known: KnownDetail,
-    blur: Float[Array, ""] | float,
-    photo_weight: Float[Array, ""] | float = 1.0,
-    plain_weight: Float[Array, ""] | float = 1.0,
-) -> Float[Array, ""]:
-    """``b sum_p w_p (K (I - P))_p^2 + c sum_p (1 - d_p) (I - L)_p^2``.
+def photo_detail_energy(image: Float[Array, "h w"], known: KnownDetail) -> Float[Array, ""]:
+    """``sum_p w_p (K (w (I - P)))_p^2``: the photo, up to the frequency that it holds.
 
-    K is a Gaussian low-pass: the first term binds the frequencies that the photo holds and leaves
-    those above to synthesis.
+    K is a Gaussian low-pass of deviation ``known.blur``; frequencies above it are left to
+    synthesis. A blur of 0 binds every frequency.
 
     Args:
-        image: Y of the texture.
-        known: photo P with weights w, low frequencies L, detail map d.
-        blur: standard deviation of K, texels; 0 binds every frequency.
-        photo_weight: b.
-        plain_weight: c.
+        image: Y of the texture, I.
+        known: photo P, weights w and the blur of K.
     """
     away = known.weight * (image - known.photo)
-    held = jnp.sum(known.weight * low_pass(away, blur) ** 2)
-    plain = jnp.sum((1.0 - known.detail) * (image - known.low_frequency) ** 2)
-    return photo_weight * held + plain_weight * plain
+    return jnp.sum(known.weight * low_pass(away, known.blur) ** 2)
+
+
+def plain_detail_energy(image: Float[Array, "h w"], known: KnownDetail) -> Float[Array, ""]:
+    """``sum_p (1 - d_p) (I - L)_p^2``: the low frequencies, where no detail belongs.
+
+    Args:
+        image: Y of the texture, I.
+        known: low frequencies L and the map d of where detail may go.
+    """
+    return jnp.sum((1.0 - known.detail) * (image - known.low_frequency) ** 2)

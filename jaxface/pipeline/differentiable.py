@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float
-from jaxface.energies._gram import StyleTargets, grams, mask_out, style_energy
+from jaxface.energies._gram import StyleData, StyleTargets, grams, mask_out, style_energy
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.colour import linear_to_srgb, rgb_to_yiq
 from jaxface.models.parameters import FaceParameters
@@ -106,7 +106,7 @@ def infer_texture(
     layers = tuple(texture_weights.layers)
 
     def statistics(image: Array) -> dict[str, Array]:
-        return grams(problem.network, image, layers, method="direct")
+        return grams(image, problem.network, layers=layers, method="direct")
 
     shown = rgb_to_yiq(linear_to_srgb(partial.albedo))[..., 0]
     target = statistics(mask_out(shown, problem.visible))
@@ -118,12 +118,10 @@ def infer_texture(
     goal = {name: jnp.einsum("k,kij->ij", w.astype(g.dtype), g) for name, g in whole.items()}
     low = problem.layout(model.reflectance(y.albedo), model.faces)
     start = rgb_to_yiq(linear_to_srgb(jnp.clip(low, 0.0, 1.0)))[..., 0]
-    targets = StyleTargets(goal, alpha=texture_weights.alpha)
+    data = StyleData(problem.network, StyleTargets(goal, alpha=texture_weights.alpha))
 
     def descend(image: Array, _: None) -> tuple[Array, None]:
-        slope = jax.grad(lambda i: style_energy(problem.network, i, targets, method="direct"))(
-            image
-        )
+        slope = jax.grad(style_energy)(image, data, method="direct")
         # alpha alone would cancel in a normalised step; the smooth bound keeps it in.
         return image - rate * slope / (1.0 + jnp.sqrt(jnp.max(slope**2) + 1e-12)), None
 

@@ -196,7 +196,7 @@ def masked_grams(
 
         cache = find_precomputed(database, network, side, layers=layers)
         columns = masked_grams(cache, mask)
-        target = grams(network, mask_out(photo_intensity, mask), layers)
+        target = grams(mask_out(photo_intensity, mask), network, layers=layers)
         blended = blend(columns, target)
 
     Args:

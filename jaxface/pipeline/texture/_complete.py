@@ -20,7 +20,6 @@ from jaxface.run.memory import hand_back_freed_memory
 from jaxface.stages.blending import Blend, blend
 from jaxface.stages.texture._synthesise import SynthesisProblem, SynthesisWeights, synthesise
 from jaxface.stages.texture.composition import (
-    PHOTO_BLUR,
     composed,
     first_intensity,
     known_detail,
@@ -261,7 +260,6 @@ class _Work:
             StyleTargets(goal, alpha=self.options.alpha),
             jnp.asarray(seen.mask[box]),
             known_detail(seen, self.detail(level), box),
-            jnp.asarray(PHOTO_BLUR * self._texels(level), first.dtype),
             SynthesisWeights(self.options.keep_photo, self.options.keep_plain),
         )
         steps = level_steps(self.options.iterations, len(self.levels))[index]

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxface._types import Array, Bool, Float
-from jaxface.energies._gram import MASKED, StyleTargets, style_energy
-from jaxface.energies.known_detail import KnownDetail, known_detail_energy
+from jaxface.energies._gram import MASKED, StyleData, StyleTargets, style_energy
+from jaxface.energies.known_detail import KnownDetail, photo_detail_energy, plain_detail_energy
 from jaxface.energies.term import Energy, Term, compose
 from jaxface.imaging.spectrum import inverse_frequency
 from jaxface.networks.texture_features.network import FeatureNetwork, prepare_kernels
@@ -38,8 +38,6 @@ class SynthesisProblem(eqx.Module):
     free: Bool[Array, "h w"]
     """texels to find; the others are ``MASKED`` for the statistics, as in the targets'"""
     known: KnownDetail
-    blur: Float[Array, ""]
-    """of what the photo shows, standard deviation in texels"""
     weights: SynthesisWeights
 
 
@@ -64,6 +62,8 @@ class Synthesis(NamedTuple):
 def synthesis_energy(tile: int | None = None, method: str = "auto") -> Energy:
     """Equation 3 and the known detail as composed terms of ``(image, SynthesisProblem)``.
 
+    They are ``style``, ``photo`` and ``plain``; the weights of the last two are in the problem.
+
     Args:
         tile: where given, statistics are summed over tiles of this side (see ``energies.gram``).
         method: of the convolutions.
@@ -71,14 +71,25 @@ def synthesis_energy(tile: int | None = None, method: str = "auto") -> Energy:
 
     def style(image: Array, problem: SynthesisProblem) -> Array:
         shown = jnp.where(problem.free, image, jnp.asarray(MASKED, image.dtype))
-        return style_energy(problem.network, shown, problem.targets, tile, method)
+        data = StyleData(problem.network, problem.targets)
+        return style_energy(shown, data, tile=tile, method=method)
 
-    def known(image: Array, problem: SynthesisProblem) -> Array:
-        held = jnp.where(problem.free, image, problem.known.low_frequency)
-        weights = problem.weights
-        return known_detail_energy(held, problem.known, problem.blur, weights.photo, weights.plain)
+    def held(image: Array, problem: SynthesisProblem) -> Array:
+        return jnp.where(problem.free, image, problem.known.low_frequency)
 
-    return compose([Term("style", style, 1.0, "scalar"), Term("known", known, 1.0, "scalar")])
+    def photo(image: Array, problem: SynthesisProblem) -> Array:
+        return photo_detail_energy(held(image, problem), problem.known)
+
+    def plain(image: Array, problem: SynthesisProblem) -> Array:
+        return plain_detail_energy(held(image, problem), problem.known)
+
+    return compose(
+        [
+            Term("style", style, 1.0, "scalar"),
+            Term("photo", photo, lambda problem: problem.weights.photo, "scalar"),
+            Term("plain", plain, lambda problem: problem.weights.plain, "scalar"),
+        ]
+    )
 
 
 def synthesise(

@@ -103,6 +103,7 @@ def known_detail(
         seen.weight[box] * seen.mask[box],
         rgb_to_yiq(seen.low_frequency)[..., 0][box],
         detail[box],
+        jnp.asarray(PHOTO_BLUR * seen.texels_per_pixel, seen.photo.dtype),
     )
 
 

@@ -51,7 +51,7 @@ def masked_statistics(
         layers: their names.
     """
     shown = mask_out(rgb_to_yiq(texture)[..., 0], jnp.asarray(mask))[box]
-    return _grams(network, shown, layers=layers, tile=box_tile(*shown.shape))
+    return _grams(shown, network, layers=layers, tile=box_tile(*shown.shape))
 
 
 def subject_texture(

@@ -1,0 +1,443 @@
+"""What the walk over all gradients cannot read from an annotation: scenes, and what is left out."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxface import energies, render, stages
+from jaxface._numerics import above_rounding
+from jaxface.energies.term import Term, compose
+from jaxface.geometry.camera import Pose
+from jaxface.geometry.normal_stencil import NormalStencil, normal_derivative, normal_stencil
+from jaxface.geometry.uv import UVLayout
+from jaxface.imaging.masks import smoothstep
+from jaxface.imaging.mipmap import Mipmap, mipmap
+from jaxface.models.face_oval import face_oval
+from jaxface.models.morphable import MorphableModel
+from jaxface.models.parameters import FaceParameters
+from jaxface.models.skin.patch import patch_at
+from jaxface.models.skin.regions import SkinFields
+from jaxface.networks.texture_features.network import FeatureNetwork
+from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.networks.texture_features.tiles import sum_over_tiles, tile_of_map
+from jaxface.render._rasterize import rasterize
+from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.records import FitConfig, FitData, FitInput, FitWeights
+from jaxface.stages.fit.solve import fit_energy, observe
+from jaxface.stages.fit.visible import visible_samples
+from jaxface.stages.texture._synthesise import SynthesisWeights
+from tests.gradient_walk import Maker
+from tests.small_scene import small_model, small_parameters, small_samples
+
+SIDE = 12
+"""px of a rendered picture"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A function with its arguments, by name.
+
+    ``held`` gives, by an argument's name, the reason why what a function returns does
+    not follow that argument as a finite difference does. ``singular`` says why differences mean
+    nothing at the singular points, where derivatives are then only finite and alike.
+    """
+
+    fn: Callable[..., Any]
+    arguments: dict[str, Any]
+    held: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    singular: str = ""
+
+
+@functools.cache
+def model() -> MorphableModel:
+    """A bump of 5 x 5 vertices with four modes of each kind and self-occlusion."""
+    made = small_model(5)
+    rng = np.random.default_rng(7)
+    four = dataclasses.replace(made.albedo, basis=40 * made.albedo.basis)
+    return dataclasses.replace(
+        made,
+        identity=made.identity.truncated(4),
+        expression=four,
+        expression_names=tuple("abcd"),
+        occlusion=jnp.asarray(-0.05 * rng.random((25, 9))),
+        occlusion_slope=jnp.asarray(0.02 * rng.normal(size=(25, 3, 9))),
+    )
+
+
+def parameters() -> FaceParameters:
+    """The bump seen from the front, a little turned."""
+    return small_parameters(model())
+
+
+def stencil() -> NormalStencil:
+    """Of the bump's mesh."""
+    return normal_stencil(np.asarray(model().faces), model().vertex_count)
+
+
+def samples() -> energies.PixelSamples:
+    """Pixels of a random photo of the bump, some unused."""
+    return small_samples(model(), parameters(), SIDE)
+
+
+def layout() -> UVLayout:
+    """Texels of random triangles, some empty."""
+    rng = np.random.default_rng(3)
+    triangle = rng.integers(-1, len(model().faces), (8, 8))
+    return UVLayout(
+        jnp.asarray(triangle),
+        jnp.asarray(rng.dirichlet(np.ones(3), (8, 8))[..., 1:]),
+        jnp.asarray(triangle >= 0),
+        jnp.asarray(rng.uniform(0.5, 2.0, len(model().faces))),
+    )
+
+
+def network() -> FeatureNetwork:
+    """Two blocks of three and four channels, in the present precision."""
+    made = random_network(((1, 3), (1, 4)), seed=3)
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), made)
+
+
+def style() -> energies.StyleData:
+    """Targets for both layers, with a weight for each."""
+    rng = np.random.default_rng(5)
+    grams = {"conv1_1": jnp.asarray(rng.random((3, 3))), "conv2_1": jnp.asarray(rng.random((4, 4)))}
+    maps = {"conv2_1": jnp.asarray(rng.random((3, 3, 4)))}
+    weights = {"conv1_1": jnp.asarray(0.5), "conv2_1": jnp.asarray(2.0)}
+    half = {"conv2_1": jnp.asarray(0.5)}
+    targets = energies.StyleTargets(grams, maps, jnp.asarray(3.0), weights, half)
+    return energies.StyleData(network(), targets)
+
+
+def landmarks() -> energies.LandmarkData:
+    """Detected near where the bump's landmarks are."""
+    rng, points = np.random.default_rng(2), model().landmarks68
+    assert points is not None
+    return energies.LandmarkData(
+        model(), points, jnp.asarray(rng.uniform(0.3, 0.7, (12, 2))),
+        jnp.asarray(rng.random(12)), jnp.array([0.5, 0.5]), jnp.asarray(0.3),
+    )  # fmt: skip
+
+
+def fit_model() -> FitModel:
+    """The bump prepared for a fit."""
+    points = model().landmarks68
+    assert points is not None
+    return FitModel(
+        model(), stencil(), points, jnp.array([0, 1]), jnp.arange(25),
+        jnp.ones(25, bool), jnp.ones(32, bool),
+    )  # fmt: skip
+
+
+def fit_weights() -> FitWeights:
+    """The defaults, as arrays."""
+    return jax.tree.map(jnp.asarray, FitWeights())
+
+
+def fit_input() -> FitInput:
+    """A random photo."""
+    rng, data = np.random.default_rng(1), landmarks()
+    return FitInput(
+        jnp.asarray(rng.uniform(0.2, 0.8, (SIDE, SIDE, 3))),
+        jnp.asarray(rng.uniform(0.2, 0.8, (SIDE, SIDE))),
+        data.target, data.weight, data.unit, data.principal,
+        parameters().log_focal, jnp.asarray(0.2), jnp.asarray(True),
+    )  # fmt: skip
+
+
+def fit_data() -> FitData:
+    """What a step of a fit holds fixed."""
+    return FitData(
+        energies.PhotometricData(model(), samples()), jnp.asarray(0.7), samples(), landmarks(),
+        jnp.asarray(0.9), jnp.asarray(np.random.default_rng(4).normal(size=(25, 3, 8))),
+        (parameters().log_focal, jnp.asarray(0.2)), fit_weights(),
+    )  # fmt: skip
+
+
+def pyramid() -> Mipmap:
+    """Three levels."""
+    return mipmap(jnp.asarray(np.random.default_rng(6).uniform(0.2, 0.8, (8, 9, 3))), 3)
+
+
+RECORDS: dict[Any, Callable[[], Any]] = {
+    MorphableModel: model,
+    FaceParameters: parameters,
+    NormalStencil: stencil,
+    UVLayout: layout,
+    FeatureNetwork: network,
+    Mipmap: pyramid,
+    FitModel: fit_model,
+    FitInput: fit_input,
+    FitData: fit_data,
+    FitWeights: fit_weights,
+    energies.PixelSamples: samples,
+    energies.LandmarkData: landmarks,
+    energies.StyleData: style,
+}
+
+
+def tables() -> dict[str, Any]:
+    """Arguments that are not floating-point arrays, by name."""
+    return {
+        "faces": model().faces, "uv_faces": model().faces,
+        "vertices": jnp.asarray(np.random.default_rng(0).integers(0, 25, (12, 3))),
+        "height": 5, "width": 6, "levels": 2, "level": 1, "canvas": SIDE, "count": 2, "stride": 1,
+        "rounds": 2, "capacity": 20, "side": float(SIDE), "resolution": 8,
+        "layers": ("conv1_1", "conv2_1"), "seed": jnp.uint32(3),
+    }  # fmt: skip
+
+
+def scene() -> dict[str, Any]:
+    """Arguments of a renderer."""
+    y = parameters()
+    return {
+        "vertices": model().shape(y.identity, y.expression),
+        "faces": model().faces,
+        "pose": Pose(y.rotation, y.translation),
+        "camera": y.camera(jnp.array([0.48, 0.53]), SIDE),
+        "light": y.light,
+    }
+
+
+def screen() -> Any:
+    """The bump's vertices in a picture of ``SIDE`` px."""
+    made = scene()
+    return made["camera"].project(made["pose"](made["vertices"]))
+
+
+def sized(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """With height and width of a picture."""
+    return functools.partial(fn, height=SIDE, width=SIDE)
+
+
+CASES: dict[str, Callable[[Maker], Case]] = {}
+"""by dotted name: a function of a ``Maker``"""
+
+
+def simple(
+    name: str,
+    fn: Callable[..., Any],
+    make: Callable[[Maker], dict[str, Any]],
+    singular: str = "",
+    **held: str,
+) -> None:
+    """A case whose arguments are made by a short function."""
+    CASES[name] = lambda maker: Case(fn, make(maker), held, singular)
+
+
+def seen(screen: Any) -> Any:
+    """The bump rasterised."""
+    return rasterize(screen, model().faces, SIDE, SIDE)
+
+
+def two_terms() -> energies.Energy:
+    """A residual and a second one whose weights are data."""
+
+    def first(args: Any) -> Any:
+        return args[0]
+
+    def second(args: Any) -> Any:
+        return args[1]
+
+    return compose([Term("a", lambda y, _: y, first), Term("b", lambda y, _: {"r": y**2}, second)])
+
+
+def observed(y: Any, image: Any, mask: Any, data: FitInput, weights: FitWeights) -> Any:
+    """The energy of a step, with all that the step chooses and weighs."""
+    config = FitConfig(compared_pixels=60, curvature_pixels=20)
+    modes = jnp.zeros((25, 3, 8))
+    step = observe(y, image, mask, SIDE, data, fit_model(), modes, weights, config=config)
+    return fit_energy().value(y, step)
+
+
+def stages_visible(image: Any) -> Any:
+    """The colours that are compared."""
+    mask = jnp.ones((SIDE, SIDE))
+    return visible_samples(parameters(), image, mask, SIDE, fit_input(), fit_model(), 60)
+
+
+IRLS = "weights of the reweighting are constants of a step"
+VISIBLE = "what is visible, and which pixels count, is chosen and held"
+
+simple("_numerics.above_rounding", above_rounding,
+       lambda m: {"total": m.numbers(4, 3), "size": m.numbers(4)},
+       singular="what is left over by rounding is cut, with its derivative")  # fmt: skip
+simple("imaging.masks.smoothstep", smoothstep,
+       lambda m: {"x": m.numbers(5), "start": jnp.array(0.1), "stop": jnp.array(0.9)})  # fmt: skip
+simple("imaging.mipmap.Mipmap.trilinear", Mipmap.trilinear, lambda m: {
+    "self": pyramid(), "points": 8 * m.numbers(7, 2), "level": 3 * m.numbers(7) - 0.7})  # fmt: skip
+simple("render._rasterize.barycentrics",
+       lambda screen: render.barycentrics(screen, model().faces, seen(screen).triangle),
+       lambda m: {"screen": screen()})  # fmt: skip
+simple("render._rasterize.rasterize", lambda screen: seen(screen), lambda m: {"screen": screen()})
+simple("render.image.render", sized(render.render),
+       lambda m: {**scene(), "albedo": m.numbers(25, 3)})  # fmt: skip
+simple("render.image.render_textured", sized(render.render_textured), lambda m: {
+    **scene(), "texture": pyramid(), "uv": model().uv, "uv_faces": model().uv_faces,
+    "occlusion": model().occlusion})  # fmt: skip
+simple(
+    "stages.fit.rendering.render_fit",
+    functools.partial(stages.render_fit, size=SIDE),
+    lambda m: {"y": parameters(), "model": fit_model(), "principal": jnp.array([0.5, 0.5])},
+)
+simple("stages._unwrap.unwrap", stages.unwrap, lambda m: {
+    **{k: v for k, v in scene().items() if k != "pose"},
+    "vertices": scene()["pose"](scene()["vertices"]), "photo": m.numbers(SIDE, SIDE, 3),
+    "mask": jnp.ones((SIDE, SIDE)), "layout": layout(), "hidden": -0.1 * m.numbers(25, 3)},
+    camera="")  # fmt: skip
+
+simple("networks.texture_features.tiles.tile_of_map", lambda values: tile_of_map(
+    values, "conv2_1", jnp.array([1, 0]), 4), lambda m: {"values": m.numbers(3, 3, 2)})  # fmt: skip
+simple(
+    "networks.texture_features.tiles.sum_over_tiles",
+    lambda network, image: sum_over_tiles(
+        lambda found, _: {k: v**2 for k, v in found.items()},
+        network,
+        image,
+        ("conv1_1", "conv2_1"),
+        4,
+    ),
+    lambda m: {"network": network(), "image": m.numbers(6, 7)},
+)
+simple("models.face_oval.face_oval", face_oval, lambda m: {"landmarks": m.numbers(68, 2)})
+simple("models.skin.patch.patch_at", patch_at, lambda m: {
+    "fields": m.make(SkinFields, "fields"), "base": m.numbers(25, 3), "faces": model().faces,
+    "triangle": jnp.arange(7), "barycentric": 0.5 * m.numbers(7, 2), "resolution": 8})  # fmt: skip
+
+simple("energies._gram.grams", functools.partial(energies.grams, layers=("conv1_1", "conv2_1")),
+       lambda m: {"image": m.numbers(6, 7), "network": network()})  # fmt: skip
+simple("energies._photometric_quadratic.photometric_jacobian", energies.photometric_jacobian,
+       lambda m: {"y": parameters(), "model": model(), "samples": samples(),
+                  "normal_modes": m.numbers(25, 3, 8)})  # fmt: skip
+simple("energies._photometric_quadratic.photometric_quadratic", energies.photometric_quadratic,
+       lambda m: {"y": parameters(), "data": energies.PhotometricData(model(), samples()),
+                  "normal_modes": m.numbers(25, 3, 8)}, y=IRLS, data=IRLS)  # fmt: skip
+simple("geometry.normal_stencil.normal_derivative", normal_derivative, lambda m: {
+    "vertices": model().mean, "stencil": stencil(), "basis": m.numbers(25, 3, 2)})  # fmt: skip
+simple("energies._photometric_quadratic.normal_modes", energies.normal_modes, lambda m: {
+    "y": parameters(), "model": model(), "stencil": stencil()})  # fmt: skip
+simple("energies.photometric.reweighting", energies.reweighting, lambda m: {
+    "difference": m.numbers(5, 3), "weight": m.numbers(5)}, difference=IRLS)  # fmt: skip
+simple("energies.photometric.photometric_residual", energies.photometric_residual, lambda m: {
+    "y": parameters(), "data": energies.PhotometricData(model(), samples())},
+    y=IRLS, data=IRLS)  # fmt: skip
+simple("energies.term.Term.value", lambda y, weight: Term(
+    "t", lambda y, weight: {"r": y**2}, lambda weight: weight).value(y, weight),
+    lambda m: {"y": m.numbers(4), "weight": m.numbers()})  # fmt: skip
+simple("energies.term.Energy.value", lambda y, args: two_terms().value(y, args),
+       lambda m: {"y": m.numbers(4), "args": m.numbers(2)})  # fmt: skip
+simple("energies.term.Energy.residual", lambda y, args: two_terms().residual(y, args),
+       lambda m: {"y": m.numbers(4), "args": m.numbers(2)})  # fmt: skip
+simple("energies.term.Energy.quadratic", lambda y, args: two_terms().quadratic(y, args)[0].value,
+       lambda m: {"y": m.numbers(4), "args": m.numbers(2)})  # fmt: skip
+simple("energies.term.sum_of_squares", energies.sum_of_squares,
+       lambda m: {"tree": {"a": m.numbers(3), "b": m.numbers(2, 2)}})  # fmt: skip
+
+simple("stages._common_light.lit_vertices", stages.lit_vertices, lambda m: {
+    "y": parameters(), "model": model(), "image": m.numbers(SIDE, SIDE, 3),
+    "mask": m.numbers(SIDE, SIDE), "principal": jnp.array([0.5, 0.5])})  # fmt: skip
+simple("stages._common_light.common_light", functools.partial(stages.common_light, rounds=3),
+       lambda m: {"photos": stages.LitVertices(m.numbers(2, 25, 3), m.numbers(2, 25, 9),
+                                               m.numbers(2, 25)),
+                  "mean": m.numbers(25, 3), "basis": 0.1 * m.numbers(25, 3, 2)})  # fmt: skip
+simple("stages.fit._posterior.posterior", lambda root, model, weight: stages.posterior(
+    root @ root.T + jnp.eye(len(root)), model, weight), lambda m: {
+    "root": m.numbers(10, 10), "model": model(), "weight": m.numbers()})  # fmt: skip
+simple("stages.fit.solve.fit_energy", lambda y, data: fit_energy().value(y, data),
+       lambda m: {"y": parameters(), "data": fit_data()})  # fmt: skip
+simple("stages.fit.solve.observe", observed, lambda m: {
+    "y": parameters(), "image": m.numbers(SIDE, SIDE, 3), "mask": m.numbers(SIDE, SIDE),
+    "data": fit_input(), "weights": fit_weights()},
+    y=VISIBLE, image=VISIBLE, mask=VISIBLE, data=VISIBLE)  # fmt: skip
+simple("stages.fit.visible.visible_samples", lambda image: stages_visible(image),
+       lambda m: {"image": m.numbers(SIDE, SIDE, 3)})  # fmt: skip
+simple(
+    "stages.texture._synthesise.synthesis_energy",
+    lambda image, problem: stages.synthesis_energy().value(image, problem),
+    lambda m: {
+        "image": m.numbers(6, 7),
+        "problem": stages.SynthesisProblem(
+            style().network,
+            style().targets,
+            m.numbers(6, 7) > 0.4,
+            m.make(energies.KnownDetail, "known"),
+            jax.tree.map(jnp.asarray, SynthesisWeights()),
+        ),
+    },
+)
+
+WEIGHTS = {
+    "FitWeights": "stages.fit.solve.observe",
+    "SynthesisWeights": "stages.texture._synthesise.synthesis_energy",
+    "StyleTargets": "energies._gram.style_energy",
+}
+"""records of weights, and the case that walks their fields"""
+
+ELSEWHERE = {
+    "FitWeights": "test_fit.py and test_differentiable.py: through the solver as well",
+}
+
+NOT_DIFFERENTIABLE = {
+    "by the implicit function theorem, against differences in test_fit and test_differentiable": [
+        "stages.fit.batch.fit_batch",
+        "stages.fit.levels.fit_parameters",
+        "stages.fit.levels.through_levels",
+        "stages.fit.levels.level_stages",
+        "stages.fit.solve.fit_start",
+        "stages.fit.solve.fit_level",
+        "stages.fit.solve.fit_landmarks",
+        "stages.fit.solve.fit_shadows",
+    ],
+    "by the implicit function theorem, against differences in test_blend": [
+        "stages.blending.weights.blend_weights",
+    ],
+    "chains of layers that are walked, at 128 px and more; whole, in test_landmarks_net": [
+        "networks.landmarks.face_detector.FaceDetector.__call__",
+        "networks.landmarks.face_mesh.LandmarkNet.__call__",
+        "networks.landmarks.face_mesh.landmarks_in_region",
+        "networks.landmarks.face_mesh.symmetric_landmarks",
+        "networks.landmarks.face_mesh.refine_landmarks",
+    ],
+    "layers that are walked, each texel's summed; discontinuous where a run skips a layer": [
+        "models.skin.synthesis.synthesise_skin",
+    ],
+    "a choice that a step holds; its docstring says that no gradient passes": [
+        "render._depth_buffer.depth_buffer",
+        "render._depth_buffer.DepthBuffer.clear_of_contours",
+        "render.occlusion.self_occlusion",
+        "render.coverage.pixel_block",
+        "render.coverage.inverse_depth_at",
+        "stages.fit._cast_shadows.cast_shadows",
+        "stages.fit.contour.slide_contour",
+        "models.morphable.MorphableModel.region_mask",
+        "networks.landmarks.face_detector.suppress",
+        "models.face_oval.face_oval_mask",
+    ],
+    "made on the host, once a model or a network": [
+        "geometry.uv.uv_layout",
+        "models.subdivide.subdivide",
+        "models.opening_rims.opening_rims",
+        "models.skin.regions.skin_fields",
+        "models.parameters.neutral_parameters",
+        "networks.texture_features.network.prepare_kernels",
+        "networks.convolution.conv3x3.prepared_kernel",
+        "stages.fit.prepared.prepare",
+        "stages.texture.masked_grams.cells.store",
+    ],
+    "drawn at random": ["models.skin.attributes.random_attributes"],
+    "makes an energy, whose value is walked": [
+        "energies.term.compose",
+        "energies.term.quadratic_by_autodiff",
+        "energies.term.Term.weight_at",
+    ],
+    "a loop on the host over an energy that is walked": ["stages.texture._synthesise.synthesise"],
+    "an algorithm of the convolution, which has the derivative": [
+        "networks.convolution.winograd.winograd_conv3x3",
+    ],
+    "gathers records": ["stages.fit.records.join_records"],
+}
+"""reason -> names"""
