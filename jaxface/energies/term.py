@@ -148,8 +148,8 @@ class Energy(NamedTuple):
             parts.append(part)
             values[term.name] = part[0]
             not_finite[term.name] = jnp.stack([~jnp.all(jnp.isfinite(x)) for x in part])
-        value, gradient, curvature = (sum(xs[1:], xs[0]) for xs in zip(*parts, strict=True))
-        return Quadratic(value, gradient, curvature, not_finite), values
+        total = jax.tree.map(lambda *xs: sum(xs[1:], xs[0]), *parts)
+        return Quadratic(total[0], total[1], total[2], not_finite), values
 
 
 def compose(terms: Sequence[Term]) -> Energy:

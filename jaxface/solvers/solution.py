@@ -58,7 +58,13 @@ def reason(solution: Solution | Any) -> str:
     if result == optx.RESULTS.successful:
         return "converged"
     if result == optx.RESULTS.nonlinear_max_steps_reached:
-        return "ended by on_step" if solution.stats.get("watcher") else "used all its steps"
+        if solution.stats.get("watcher"):
+            return "ended by on_step"
+        gap = solution.stats.get("relative_gap")
+        certified = (
+            "" if gap is None else f"; the certified gap is {float(gap):.1e} of the objective"
+        )
+        return f"used all its steps{certified}"
     if result == optx.RESULTS.stagnation:
         return "stuck: no step lowered the energy, though its gradient is not small"
     if result == optx.RESULTS.nonfinite:

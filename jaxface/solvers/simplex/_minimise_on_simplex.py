@@ -13,16 +13,16 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax.core import Tracer
 
 from jaxface._types import Array, Float
+from jaxface.solvers.finiteness import TOTAL, flags, holds_no_number
 from jaxface.solvers.simplex._projected_gradient import projected_gradient
 from jaxface.solvers.simplex._working_set import working_set
 from jaxface.solvers.simplex.answer import ZERO, Answer, Norm, rounded
 from jaxface.solvers.simplex.implicit import with_derivative
 from jaxface.solvers.simplex.many import better, pays, solve_many
-from jaxface.solvers.solution import Solution
+from jaxface.solvers.solution import Solution, stopped
 
 Method = Literal["working_set", "interior_point", "projected_gradient"]
 
@@ -54,7 +54,8 @@ def minimise_on_simplex(
     problems are solved one after another, so that an easy one does not wait for a hard one;
     many targets over points that are not mapped over share what they can (`simplex_many`).
 
-    Methods: ``working_set`` (column generation over an interior point method; the default),
+    Methods: ``working_set`` (column generation over an interior point method, and for up to 256
+    points a slower one for what that leaves; the default),
     ``interior_point`` (over all points at once), ``projected_gradient`` (jaxopt; inexact).
 
     Args:
@@ -66,7 +67,10 @@ def minimise_on_simplex(
         tolerance: relative gap to stop at.
 
     Returns:
-        ``value``: the weights. ``stats``: the other fields of `Answer`, by name.
+        ``value``: the weights. ``stats``: the other fields of `Answer`, by name, and
+        ``not_finite``, see `Solution`. Where the gap stays above the tolerance the result is
+        ``nonlinear_max_steps_reached``, and `reason` tells the gap: points that differ by 1e-7 of
+        their distances or less cost digits of it.
 
     Raises:
         ValueError: shapes do not fit together, or an unknown norm or method.
@@ -89,9 +93,10 @@ def minimise_on_simplex(
         tuple(jnp.asarray(points[:, i], dtype) for i in terms),
         tuple(jnp.asarray(target[i], dtype) for i in terms),
     )
-    stats = answer._asdict() | {"objective": objective}
+    broken = holds_no_number((answer.weights, answer.objective))
+    stats = answer._asdict() | {"objective": objective, "not_finite": {TOTAL: flags(broken)}}
     del stats["weights"], stats["converged"]
-    return Solution(value, _result(answer.converged), stats)
+    return Solution(value, stopped(broken, answer.converged, False), stats)
 
 
 def solve(
@@ -194,11 +199,6 @@ def _double(x: Any) -> Array:
     if isinstance(x, jax.Array):
         return jax.lax.convert_element_type(x, jnp.float64)
     return jnp.asarray(x, jnp.float64)
-
-
-def _result(converged: Array) -> Any:
-    good, limit = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
-    return optx.RESULTS.where(converged, good, limit)
 
 
 def _check(points: Any, target: Any, norm: str, method: str, start: Any) -> None:

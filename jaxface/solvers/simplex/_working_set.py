@@ -3,7 +3,8 @@
 Few points carry weight at the solution. A small problem is solved exactly on a working set;
 the prices of all the points either certify the answer or say which points to bring in (von
 Hohenbalken, "Simplicial decomposition in nonlinear programming algorithms", 1977). Where the
-support outgrows the set, a larger one takes over, at last all points.
+support outgrows the set, a larger one takes over, at last all points; what is still open of a small
+problem then, the central path closes.
 """
 
 from collections.abc import Callable
@@ -15,12 +16,15 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from jaxface._types import Array, Bool, Float, Int
+from jaxface.solvers.simplex._barrier import central_path
 from jaxface.solvers.simplex._interior_point import interior_point
 from jaxface.solvers.simplex._polish import polish
 from jaxface.solvers.simplex.certificate import Certificate, certify
 
 SETS = (64, 256)
 """sizes of the working set that are tried in turn, before all points"""
+SLOW = 256
+"""most points over which the central path is followed"""
 DUST = 1e-10
 """weights below this share of the largest are rounded to zero"""
 
@@ -93,6 +97,18 @@ def all_points(points: Array, start: Found, tolerance: Array, floor: Array) -> F
     )
 
 
+@jax.jit
+def along_the_path(points: Array, start: Found, tolerance: Array, floor: Array) -> Found:
+    """The slow and sure method over every point, kept as far as it helps."""
+    weights, dual, steps = central_path(points, 0.03 * tolerance, floor)
+    found, _ = improved(start, cleaned(weights), dual, points)
+    return found._replace(
+        rounds=found.rounds + 1,
+        steps=found.steps + steps,
+        converged=closed(found.certificate, tolerance, floor),
+    )
+
+
 def working_set(
     points: Float[Array, "k l m"],
     weights: Float[Array, " k"],
@@ -122,7 +138,10 @@ def working_set(
 
         found = unless_converged(attempt, found)
         found = unless_converged(lambda f: polished(points, f, tolerance, floor), found)
-    return found
+    if len(points) > SLOW:
+        return found
+    found = unless_converged(lambda f: along_the_path(points, f, tolerance, floor), found)
+    return unless_converged(lambda f: polished(points, f, tolerance, floor), found)
 
 
 def unless_converged(function: Callable[[Found], Found], found: Found) -> Found:

@@ -31,7 +31,7 @@ class Answer(NamedTuple):
         dual: the vectors ``y_l`` of the bound.
         rounds: exchanges of the working set.
         steps: steps of the method, in all.
-        converged: within the tolerance before rounding to single precision.
+        converged: within the tolerance, before or after rounding.
     """
 
     weights: Float[Array, " k"]
@@ -71,6 +71,7 @@ def rounded(
     objective = jnp.sum(jnp.linalg.norm(r, axis=-1)) * scale
     norms = jnp.linalg.norm(r.reshape(target.shape), axis=-1) * scale
     bound = found.certificate.bound * scale
+    done = (objective - bound <= tolerance * objective) | (objective <= ZERO * scale)
     dual = found.certificate.dual.reshape(target.shape)
     if norm == "squared":
         gap = (objective - bound) * (objective + bound)
@@ -84,7 +85,7 @@ def rounded(
         lower = jnp.where(lower.astype(bound.dtype) > bound, jnp.nextafter(lower, -jnp.inf), lower)
     answer = Answer(
         weights, objective, lower, gap, relative, scale, norms, dual,
-        found.rounds, found.steps, found.converged,
+        found.rounds, found.steps, found.converged | done,
     )  # fmt: skip
     narrow = {
         name: jax.lax.convert_element_type(value, dtype)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxface._types import Array, Float
 
 SUPPORT = 256
-"""positive weights up to which the derivative is computed"""
+"""positive weights for which the derivative is computed; for more, as if all were positive"""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -33,8 +33,8 @@ def with_derivative(
     a vertex the derivative is zero. Where the minimiser is not unique (points in
     special position), the derivative is the shortest. Where the residual of a term vanishes, its
     norm is rounded off within 1e-5 of the points' distance (3e-4 in single precision): the
-    derivative then keeps the residual at zero as well as the weights can. With more than 256
-    positive weights the derivative is NaN.
+    derivative then keeps the residual at zero as well as the weights can. More than 256 positive
+    weights take the time of all of them.
     """
     return weights, objective
 
@@ -42,24 +42,36 @@ def with_derivative(
 @with_derivative.defjvp
 def _jvp(squared: bool, primals: tuple, tangents: tuple) -> tuple:
     weights, objective, points, target = primals
-    _, _, dpoints, dtarget = tangents
-    size = min(SUPPORT, len(weights))
-    w, chosen = jax.lax.top_k(weights, size)
-    near = [p[chosen] - t for p, t in zip(points, target, strict=True)]
-    units, normals, lengths, inverse = _linearised(squared, near, w)
-    inverse = jnp.where(jnp.sum(weights > 0) > size, jnp.nan, inverse)
+    changes = tangents[2:]
+    count = len(weights)
 
-    slope, change = jnp.zeros_like(w), jnp.zeros_like(objective)
-    for p, y, normal, phi, dp, dt in zip(
-        near, units, normals, lengths, dpoints, dtarget, strict=True
-    ):
+    def derivative(size: int, dpoints: tuple, dtarget: tuple) -> tuple[Array, Array]:
+        return _derivative(squared, size, weights, (points, target), (dpoints, dtarget))
+
+    if count <= SUPPORT:
+        found = derivative(count, *changes)
+    else:
+        few = jnp.sum(weights > 0) <= SUPPORT
+        branches = (partial(derivative, SUPPORT), partial(derivative, count))
+        found = jax.lax.cond(few, *branches, *changes)
+    return (weights, objective), (found[0], found[1].astype(objective.dtype))
+
+
+def _derivative(
+    squared: bool, size: int, weights: Array, data: tuple, changes: tuple
+) -> tuple[Array, Array]:
+    """Changes of weights and objective, for ``size`` positive weights at most."""
+    w, chosen = jax.lax.top_k(weights, size)
+    near = [p[chosen] - t for p, t in zip(*data, strict=True)]
+    units, normals, lengths, inverse = _linearised(squared, near, w)
+    slope, change = jnp.zeros_like(w), jnp.zeros((), weights.dtype)
+    for p, y, normal, phi, dp, dt in zip(near, units, normals, lengths, *changes, strict=True):
         near_change = dp[chosen] - dt
         dr = w @ near_change
         slope = slope + near_change @ y + p @ ((dr - normal * jnp.dot(normal, dr)) / phi)
         change = change + (2.0 if squared else 1.0) * jnp.dot(y, dr)
     step = -(inverse @ slope).astype(weights.dtype)
-    dw = jnp.zeros_like(weights).at[chosen].set(step, unique_indices=True)
-    return (weights, objective), (dw, change.astype(objective.dtype))
+    return jnp.zeros_like(weights).at[chosen].set(step, unique_indices=True), change
 
 
 def _linearised(
