@@ -15,6 +15,7 @@ from jaxface.stages.fit.records import (
     LevelRecord,
 )
 from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
+from jaxface.stages.fit.self_shadow import with_self_shadow
 from jaxface.stages.fit.solve import (
     fit_energy,
     fit_level,
@@ -48,5 +49,6 @@ __all__ = [
     "render_fit",
     "skin_map",
     "through_levels",
+    "with_self_shadow",
     "working_photo",
 ]
