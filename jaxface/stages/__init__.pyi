@@ -1,8 +1,10 @@
 from ._common_light import (
     CommonLight,
     LitVertices,
+    SharedLight,
     common_light,
     lit_vertices,
+    shared_light,
 )
 from ._unwrap import PartialAlbedo, unwrap
 from .blending import (
@@ -32,6 +34,7 @@ from .fit import (
     render_fit,
     skin_map,
     weights_as_data,
+    with_self_shadow,
     working_photo,
 )
 from .landmarks import (
@@ -40,6 +43,18 @@ from .landmarks import (
     SeveralFacesError,
     detect_faces,
     detect_one,
+)
+from .scan._embed_landmarks import Embedding, embed_landmarks, with_landmarks
+from .scan._scan_landmarks import scan_landmarks
+from .scan.head_scan import HeadScan
+from .scan.register import RegisteredScan, register_topology
+from .scan.transfer import (
+    TransferredTexture,
+    complete_texture,
+    resample_texture,
+    surface_uv,
+    transfer_texture,
+    whole_texture,
 )
 from .texture._plausible_skin import plausible_skin
 from .texture._synthesise import (
@@ -63,11 +78,13 @@ from .texture.mirror import (
     with_other_side,
 )
 from .texture.octaves import octave_bands, with_photos_octaves
+from .texture.specularity import without_specularity
 
 __all__ = [
     "Blend",
     "CommonLight",
     "DetectedFace",
+    "Embedding",
     "FitConfig",
     "FitData",
     "FitInput",
@@ -76,20 +93,26 @@ __all__ = [
     "FitRender",
     "FitStats",
     "FitWeights",
+    "HeadScan",
     "LitVertices",
     "NoFaceError",
     "PartialAlbedo",
     "Posterior",
+    "RegisteredScan",
     "SeveralFacesError",
+    "SharedLight",
     "Synthesis",
     "SynthesisProblem",
     "SynthesisWeights",
+    "TransferredTexture",
     "WorkingPhoto",
     "blend",
     "blended_grams",
     "common_light",
+    "complete_texture",
     "detect_faces",
     "detect_one",
+    "embed_landmarks",
     "fill_from_mirror",
     "fit_batch",
     "fit_energy",
@@ -105,18 +128,28 @@ __all__ = [
     "plausible_skin",
     "posterior",
     "prepare",
+    "register_topology",
     "render_fit",
+    "resample_texture",
+    "scan_landmarks",
+    "shared_light",
     "skin_map",
+    "surface_uv",
     "synthesis_energy",
     "synthesise",
+    "transfer_texture",
     "unconstrained",
     "unwrap",
+    "weights_as_data",
+    "whole_texture",
     "with_complexion",
     "with_intensity",
+    "with_landmarks",
     "with_other_side",
     "with_photo",
     "with_photos_octaves",
+    "with_self_shadow",
     "without_marks",
-    "weights_as_data",
+    "without_specularity",
     "working_photo",
 ]

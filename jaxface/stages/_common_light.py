@@ -9,14 +9,17 @@ is linear in each of the light L, the exposure gains g_i and the albedo coeffici
 the other two are held, so all three are found in closed form by turns, reweighted robustly.
 """
 
+from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxface._numerics import safe_norm
-from jaxface._types import Array, Float
+from jaxface._types import Array, Bool, Float
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.imaging.masks import smoothstep
@@ -26,6 +29,9 @@ from jaxface.models.parameters import FaceParameters
 from jaxface.render._depth_buffer import depth_buffer
 from jaxface.render.occlusion import sh_rotation
 from jaxface.render.shading import Y0, sh_basis
+
+WORST_MISFIT = 1.5
+"""misfit under the common light, over that under its own, from which a photo keeps its own"""
 
 
 class LitVertices(eqx.Module):
@@ -49,6 +55,24 @@ class CommonLight(eqx.Module):
     """albedo coefficients, standard deviations"""
     misfit: Float[Array, "k"]
     """weighted median over the vertices of ``|C - C_synth| / |C|`` of each photo"""
+
+
+class SharedLight(NamedTuple):
+    """The light that most of some photos share, and which of them do.
+
+    Attributes:
+        light: (9, 3) shading coefficients for a gain of 1; None where no two photos share one.
+        gains: (k,) exposure of each photo under it.
+        alike: (k,) photos that it explains about as well as their own does.
+        misfit: (k,) of each photo under it.
+        own_misfit: (k,) of each photo under its own.
+    """
+
+    light: Float[Array, "9 3"] | None
+    gains: Float[Array, "k"]
+    alike: Bool[np.ndarray, "k"]
+    misfit: Float[Array, "k"]
+    own_misfit: Float[np.ndarray, "k"]
 
 
 @partial(jax.jit, static_argnames=("depth_size",))
@@ -189,6 +213,48 @@ def common_light(
     synth = gains[:, None, None] * albedo_of(alpha) * shading
     off = safe_norm(colour - synth) / jnp.maximum(safe_norm(colour), 1e-3)
     return CommonLight(found, gains * unit, alpha, jax.vmap(_weighted_median)(off, share))
+
+
+def shared_light(
+    photos: Sequence[LitVertices],
+    mean: Float[Array, "n 3"],
+    basis: Float[Array, "n 3 a"],
+    *,
+    light: Float[Array, "9 3"] | None = None,
+) -> SharedLight:
+    """The common light of those photos that have one, each in its own exposure.
+
+    A photo whose misfit under the common light is more than ``WORST_MISFIT`` times that under a
+    light of its own is not under it, and must not bend the light that the rest share.
+
+    Args:
+        photos: what each shows.
+        mean: albedo of the mean face, linear RGB.
+        basis: change of the albedo for one standard deviation of each coefficient.
+        light: known already, from other photos.
+
+    Raises:
+        ValueError: as ``common_light``.
+    """
+    stacked: LitVertices = jax.tree.map(lambda *x: jnp.stack(x), *photos)
+    own = [common_light(jax.tree.map(lambda x: x[None], photo), mean, basis) for photo in photos]
+    least = np.array([float(o.misfit[0]) for o in own])
+
+    def alike(solved: CommonLight) -> Bool[np.ndarray, "k"]:
+        return np.asarray(solved.misfit) <= WORST_MISFIT * np.maximum(least, 0.02)
+
+    if light is None:
+        solved = common_light(stacked, mean, basis)
+        under = alike(solved)
+        if under.sum() < 2:
+            # A light that one photo alone follows is nobody's common light.
+            return SharedLight(None, solved.gains, under, solved.misfit, least)
+        if under.sum() < len(under):
+            chosen = jax.tree.map(lambda x: x[np.flatnonzero(under)], stacked)
+            solved = common_light(chosen, mean, basis)
+        light = solved.light
+    solved = common_light(stacked, mean, basis, light=light)
+    return SharedLight(light, solved.gains, alike(solved), solved.misfit, least)
 
 
 def _weighted_median(values: Float[Array, "n"], weight: Float[Array, "n"]) -> Float[Array, ""]:

@@ -1,6 +1,5 @@
 """A database of textures from a folder of photos, as Saito 2017 (section 6) made theirs."""
 
-import dataclasses
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,16 +20,14 @@ from jaxface.pipeline.databases.photo_fits import BuildStep, FittedPhoto, fit_ph
 from jaxface.pipeline.fitting._detail_levels import detail_levels
 from jaxface.pipeline.folder import photos_in
 from jaxface.pipeline.texture.partial import texture
-from jaxface.render.occlusion import self_occlusion
-from jaxface.stages._common_light import CommonLight, LitVertices, common_light, lit_vertices
+from jaxface.stages._common_light import lit_vertices, shared_light
+from jaxface.stages.fit import with_self_shadow
 from jaxface.stages.fit.options import FitOptions, FitOverrides
 from jaxface.stages.scan.transfer import TransferredTexture, whole_texture
 from jaxface.stages.texture.mirror import fill_from_mirror, mirror_uv
 
 FITS = "fits"
 LIGHT = "common_light.npz"
-WORST_MISFIT = 1.5
-"""misfit under the common light, over that under its own, from which a photo keeps its own"""
 
 
 def build_database(
@@ -64,7 +60,7 @@ def build_database(
         out: folder of the database, new or begun.
         resolution: texels along a side.
         common_light: whether the photos were taken under one light. One that this light
-            explains much worse than its own (``WORST_MISFIT``) keeps its own, and is told.
+            explains much worse than its own keeps its own, and is told.
         licence: of the photos; they are people's, and only you know what you may do with them.
         credits: lines for the database.
         on_progress: called after each photo of each stage.
@@ -109,7 +105,7 @@ def build_database(
         database = begun()
         if all(database.is_whole(n) for n in names):
             return database
-    face = _with_occlusion(face, options.self_shadow)
+    face = with_self_shadow(face, options.self_shadow)
     fits, first_problem = fit_photos(photos, names, Path(out) / FITS, face, options, tell)
     if not fits:
         raise ValueError(f"no photo of {folder} could be fitted; the first: {first_problem}")
@@ -129,11 +125,6 @@ def build_database(
             )
         tell(BuildStep("texture", index + 1, len(sources), source.path, problem))
     return database
-
-
-def _with_occlusion(model: MorphableModel, wanted: bool) -> MorphableModel:
-    known = self_occlusion(model.mean, model.faces) if wanted else None
-    return dataclasses.replace(model, occlusion=known, occlusion_slope=None)
 
 
 def subject_name(photo: str | os.PathLike[str]) -> str:
@@ -168,40 +159,27 @@ def _lights(
         # All in the units of the photos' own linear light, in which exposures compare.
         gains.append(fitted.working.gain)
         samples.append(eqx.tree_at(lambda v: v.colour, seen, seen.colour / fitted.working.gain))
-    stacked: LitVertices = jax.tree.map(lambda *x: jnp.stack(x), *samples)
-    mean, basis = model.albedo_mean, model.albedo.basis
     known = _read_light(file)
-    own = [
-        common_light(jax.tree.map(lambda x, i=i: x[i : i + 1], stacked), mean, basis)
-        for i in range(len(samples))
-    ]
+    shared = shared_light(samples, model.albedo_mean, model.albedo.basis, light=known)
+    if shared.light is None:
+        told = (
+            f"the photos share no light: {shared.alike.sum()} of {len(samples)} would be under it"
+        )
+        return {
+            n: _Lighting(s.parameters.light, _facts(s, "own"), f"{s.path.name}: {told}")
+            for n, s in sources.items()
+        }
     if known is None:
-        solved = common_light(stacked, mean, basis)
-        alike = _alike(solved, own)
-        if alike.sum() < 2:
-            # A light that one photo alone follows is nobody's common light.
-            told = f"the photos share no light: {alike.sum()} of {len(alike)} would be under it"
-            return {
-                n: _Lighting(s.parameters.light, _facts(s, "own"), f"{s.path.name}: {told}")
-                for n, s in sources.items()
-            }
-        if alike.sum() < len(alike):
-            # Photos under another light must not bend the one that the rest share.
-            chosen = jax.tree.map(lambda x: x[np.flatnonzero(alike)], stacked)
-            solved = common_light(chosen, mean, basis)
-        known = solved.light
         with atomic_path(file) as temporary, open(temporary, "wb") as handle:
-            np.savez(handle, light=np.asarray(known))
-    solved = common_light(stacked, mean, basis, light=jnp.asarray(known))
-    alike = _alike(solved, own)
+            np.savez(handle, light=np.asarray(shared.light))
     result = {}
     for i, (subject, source) in enumerate(sources.items()):
-        misfit, least = float(solved.misfit[i]), float(own[i].misfit[0])
+        misfit, least = float(shared.misfit[i]), float(shared.own_misfit[i])
         facts = {"misfit": round(misfit, 4), "own_light_misfit": round(least, 4)}
-        if alike[i]:
-            exposure = float(solved.gains[i])
+        if shared.alike[i]:
+            exposure = float(shared.gains[i])
             facts = {**_facts(source, "common"), "light_gain": round(exposure, 4), **facts}
-            result[subject] = _Lighting(solved.light * exposure * gains[i], facts, None)
+            result[subject] = _Lighting(shared.light * exposure * gains[i], facts, None)
         else:
             problem = (
                 f"{source.path.name} is not under the common light (misfit {misfit:.3f}, under "
@@ -212,12 +190,7 @@ def _lights(
     return result
 
 
-def _alike(solved: CommonLight, own: Sequence[CommonLight]) -> np.ndarray:
-    least = np.array([float(o.misfit[0]) for o in own])
-    return np.asarray(solved.misfit) <= WORST_MISFIT * np.maximum(least, 0.02)
-
-
-def _read_light(file: Path) -> Float[np.ndarray, "9 3"] | None:
+def _read_light(file: Path) -> Float[Array, "9 3"] | None:
     if not file.is_file():
         return None
     try:
@@ -227,7 +200,7 @@ def _read_light(file: Path) -> Float[np.ndarray, "9 3"] | None:
         raise ValueError(f"{file} cannot be read ({error}); delete it to solve anew") from error
     if light.shape != (9, 3) or not np.isfinite(light).all():
         raise ValueError(f"{file} holds no light of (9, 3) numbers; delete it to solve anew")
-    return light
+    return jnp.asarray(light)
 
 
 def _facts(source: FittedPhoto, light: str) -> dict[str, Any]:

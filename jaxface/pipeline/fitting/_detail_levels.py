@@ -1,6 +1,5 @@
 """A model at the levels of detail of a fit, and the last one's kept."""
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 
@@ -8,8 +7,7 @@ import jax
 
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
-from jaxface.render.occlusion import self_occlusion
-from jaxface.stages.fit import FitModel, prepare
+from jaxface.stages.fit import FitModel, prepare, with_self_shadow
 
 SUBDIVIDED_BELOW = 20_000
 """models with fewer vertices are refined once for the finer pyramid levels"""
@@ -47,14 +45,6 @@ def detail_levels(
     return tuple(prepared[detail] for detail in details)
 
 
-def _with_self_shadow(model: MorphableModel, wanted: bool) -> MorphableModel:
-    if not wanted:
-        return dataclasses.replace(model, occlusion=None, occlusion_slope=None)
-    if model.occlusion is not None:
-        return model
-    return dataclasses.replace(model, occlusion=self_occlusion(model.mean, model.faces))
-
-
 class _Same:
     """A model as a key: equal to itself alone."""
 
@@ -72,7 +62,7 @@ class _Same:
 def _kept_levels(
     same: _Same, self_shadow: bool, count: int, levels: int, details: tuple[int, ...] | None
 ) -> tuple[FitModel, ...]:
-    return detail_levels(_with_self_shadow(same.model, self_shadow), count, levels, details)
+    return detail_levels(with_self_shadow(same.model, self_shadow), count, levels, details)
 
 
 def prepared_levels(

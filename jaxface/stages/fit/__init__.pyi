@@ -16,6 +16,7 @@ from .records import (
     no_history,
 )
 from .rendering import FitRender, fit_hidden_shading, render_fit, skin_map
+from .self_shadow import with_self_shadow
 from .solve import fit_level, fit_shadows, observe, observe_finest
 from .start import fit_start
 
@@ -51,5 +52,6 @@ __all__ = [
     "skin_map",
     "through_levels",
     "weights_as_data",
+    "with_self_shadow",
     "working_photo",
 ]
