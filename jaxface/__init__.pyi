@@ -10,6 +10,7 @@ from .pipeline.texture.folder import complete_folder
 from .pipeline.texture.partial import texture
 from .stages.fit import FitWeights
 from .stages.landmarks import detect_faces
+from .stages.texture._synthesise_texture import synthesise_texture
 
 __version__: str
 
@@ -31,5 +32,6 @@ __all__ = [
     "save_fit",
     "solvers",
     "stages",
+    "synthesise_texture",
     "texture",
 ]

@@ -46,6 +46,7 @@ from .texture._synthesise import (
     synthesis_energy,
     synthesise,
 )
+from .texture._synthesise_texture import TextureSynthesis, synthesise_texture
 from .texture.detail import (
     with_complexion,
     with_intensity,
@@ -80,6 +81,7 @@ __all__ = [
     "Synthesis",
     "SynthesisProblem",
     "SynthesisWeights",
+    "TextureSynthesis",
     "WorkingPhoto",
     "blend",
     "blended_grams",
@@ -104,6 +106,7 @@ __all__ = [
     "skin_map",
     "synthesis_energy",
     "synthesise",
+    "synthesise_texture",
     "unconstrained",
     "unwrap",
     "with_complexion",
