@@ -19,7 +19,7 @@ E(I) = alpha / N sum_o sum_l ||G^l(I_o) - G^l_hat_o||_F^2 / ||G^l_hat_o||_F^2
 
 A network sees one channel. A coloured picture is shown to it along each axis of the exemplar's
 colours, and the Gramian is that of all their responses together, so that it also holds which
-colours come with which shapes. Responses that see beyond the border are not counted.
+colours come with which shapes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -109,8 +109,10 @@ def exemplar_targets(
         )
     # Beyond half of a picture few pairs of pixels are left to tell a lag by.
     reach = tuple(min(a, b) // 2 for a, b in zip(exemplar.shape[:2], size, strict=True))
-    found = _statistics(network, exemplar, colours, plan, (reach[0], reach[1]))
-    return ExemplarTargets(network, colours, *found, weights)
+    grams, correlation, quantiles = _statistics(
+        network, exemplar, colours, plan, (reach[0], reach[1])
+    )
+    return ExemplarTargets(network, colours, grams, correlation, quantiles, weights)
 
 
 @partial(jax.jit, static_argnums=(3, 4))
@@ -163,23 +165,9 @@ def octave_grams(
         channels = halve(channels) if octave else channels
         each = [features(network, channels[..., c], names) for c in range(channels.shape[-1])]
         found.append(
-            {
-                name: gram(
-                    jnp.concatenate([_inner(network, maps[name], name) for maps in each], axis=-1)
-                )
-                for name in names
-            }
+            {name: gram(jnp.concatenate([maps[name] for maps in each], axis=-1)) for name in names}
         )
     return tuple(found)
-
-
-def _inner(network: FeatureNetwork, values: Float[Array, "h w n"], layer: str) -> Array:
-    """A map without the rim that sees beyond the picture, but for half of each side at least."""
-    rim = 0
-    for block in blocks_up_to(network, [layer]):
-        rim = -(-rim // 2) + sum(layer_position(name) <= layer_position(layer) for name in block)
-    rows, columns = (min(rim, side // 4) for side in values.shape[:2])
-    return values[rows : values.shape[0] - rows, columns : values.shape[1] - columns]
 
 
 def exemplar_gram_residual(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Float
+from jaxface._types import Array, Float, Shaped
 from jaxface.energies.exemplar import (
     SMALLEST_MAP,
     ExemplarTargets,
@@ -33,6 +33,8 @@ from jaxface.networks.texture_features.network import (
     prepare_kernels,
 )
 from jaxface.solvers._minimise import Method, minimise
+
+Picture = Shaped[Array, "h w *c"] | Shaped[np.ndarray, "h w *c"]
 
 COARSEST = 32
 """px: exemplar and texture are halved while their shorter sides stay at least so long"""
@@ -60,7 +62,7 @@ class TextureSynthesis(NamedTuple):
 
 
 def synthesise_texture(
-    image: Float[Array, "h w c"],
+    image: Picture,
     network: FeatureNetwork,
     *,
     layers: Sequence[str] | None = None,
@@ -218,7 +220,7 @@ def _noise(
     return jnp.mean(_unbounded(exemplar), axis=(0, 1)) + coloured
 
 
-def _checked(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+def _checked(image: Picture) -> Float[Array, "h w c"]:
     values = np.asarray(image)
     if values.ndim == 2:
         values = values[..., None]
