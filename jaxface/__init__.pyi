@@ -11,6 +11,7 @@ from .pipeline.texture.partial import texture
 from .run.compile_cache import enable_compilation_cache
 from .stages.fit import FitOptions, FitWeights
 from .stages.landmarks import detect_faces
+from .stages.texture._synthesise_texture import synthesise_texture
 
 __version__: str
 
@@ -34,5 +35,6 @@ __all__ = [
     "save_fit",
     "solvers",
     "stages",
+    "synthesise_texture",
     "texture",
 ]

@@ -30,6 +30,7 @@ app.add_typer(model_app, name="model")
 app.add_typer(textures.database_app, name="database")
 app.add_typer(textures.features_app, name="features")
 app.command("texture")(textures.texture)
+app.command("synthesise")(textures.synthesise)
 
 
 def _print_version(wanted: bool) -> None:

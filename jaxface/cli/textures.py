@@ -53,6 +53,43 @@ def texture(
         console.print("compared by the statistics that `jaxface database precompute` keeps")
 
 
+def synthesise(
+    picture: Annotated[Path, typer.Argument(help="Picture of a texture, all of it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")],
+    features: FeaturesOption = "random",
+    size: Annotated[
+        str | None, typer.Option("--size", help="Side, or HEIGHTxWIDTH, px; as the picture's.")
+    ] = None,
+    layers: Annotated[
+        str | None, typer.Option("--layers", help="As conv1_1,conv2_1; the first of each block.")
+    ] = None,
+    alpha: Annotated[float, typer.Option("--alpha", help="Weight of the Gram matrices.")] = 1.0,
+    correlation: Annotated[
+        float, typer.Option("--correlation", help="Weight of what repeats at a distance.")
+    ] = 0.0,
+    histogram: Annotated[
+        float, typer.Option("--histogram", help="Weight of the distribution of colours.")
+    ] = 0.1,
+    octaves: Annotated[
+        int, typer.Option("--octaves", help="Sizes at which the network sees the picture.")
+    ] = 4,
+    steps_: Annotated[int, typer.Option("--steps", help="Of the solver on each level.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", help="Of the noise at the start.")] = 0,
+) -> None:
+    """A new picture of a texture, of any size, from a picture of it."""
+    from jaxface.pipeline.texture.exemplar import parse_size, synthesise_file
+
+    with errors(), steps(str(picture)) as on_step:
+        made = synthesise_file(
+            picture, out, features=features, size=parse_size(size), alpha=alpha,
+            layers=None if layers is None else tuple(layers.split(",")), correlation=correlation,
+            histogram=histogram, octaves=octaves, steps=steps_, seed=seed,
+            on_step=lambda done, of: on_step("steps", done, of),
+        )  # fmt: skip
+    first, last = made.values[-1][0], made.values[-1][-1]
+    console.print(f"energy of the last level {first:.3g} to {last:.3g}; wrote [bold]{out}[/bold]")
+
+
 @database_app.command("list")
 def database_list() -> None:
     """Databases in the cache."""

@@ -17,6 +17,15 @@ from ._photometric_quadratic import (
     photometric_quadratic,
     shape_basis,
 )
+from .exemplar import (
+    ExemplarTargets,
+    ExemplarWeights,
+    exemplar_correlation_residual,
+    exemplar_energy,
+    exemplar_gram_residual,
+    exemplar_histogram_residual,
+    exemplar_targets,
+)
 from .known_detail import KnownDetail, photo_detail_energy, plain_detail_energy
 from .landmark import LandmarkData, landmark_difference, landmark_residual
 from .photometric import (
@@ -42,6 +51,8 @@ from .term import (
 __all__ = [
     "DETAIL_WEIGHT",
     "Energy",
+    "ExemplarTargets",
+    "ExemplarWeights",
     "KnownDetail",
     "LandmarkData",
     "MASKED",
@@ -52,6 +63,11 @@ __all__ = [
     "StyleTargets",
     "Term",
     "compose",
+    "exemplar_correlation_residual",
+    "exemplar_energy",
+    "exemplar_gram_residual",
+    "exemplar_histogram_residual",
+    "exemplar_targets",
     "feature_loss",
     "focal_residual",
     "gram",

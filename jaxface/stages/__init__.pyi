@@ -64,6 +64,7 @@ from .texture._synthesise import (
     synthesis_energy,
     synthesise,
 )
+from .texture._synthesise_texture import TextureSynthesis, synthesise_texture
 from .texture.detail import (
     with_complexion,
     with_intensity,
@@ -104,6 +105,7 @@ __all__ = [
     "Synthesis",
     "SynthesisProblem",
     "SynthesisWeights",
+    "TextureSynthesis",
     "TransferredTexture",
     "WorkingPhoto",
     "blend",
@@ -137,6 +139,7 @@ __all__ = [
     "surface_uv",
     "synthesis_energy",
     "synthesise",
+    "synthesise_texture",
     "transfer_texture",
     "unconstrained",
     "unwrap",
