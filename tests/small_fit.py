@@ -9,6 +9,7 @@ import numpy as np
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters
 from jaxface.render.image import render
+from jaxface.stages.fit import prepare
 from tests.small_scene import small_model, small_parameters
 
 SIDE = 96
@@ -27,13 +28,9 @@ def small_face() -> MorphableModel:
     return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype.kind == "f" else x, model)
 
 
-def small_photo(
-    model: MorphableModel, y: FaceParameters | None = None
-) -> tuple[np.ndarray, np.ndarray, FaceParameters]:
+def small_photo(model: MorphableModel) -> tuple[np.ndarray, np.ndarray, FaceParameters]:
     """The photo (sRGB-encoded, grey about the bump), its landmarks (px), and what it shows."""
-    if y is None:
-        y = small_parameters(model)
-        y = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), y)
+    y = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), small_parameters(model))
     shape, principal = model.shape(y.identity, y.expression), jnp.array([0.5, 0.5])
     camera = y.camera(principal, SIDE)
     picture = render(
@@ -41,5 +38,5 @@ def small_photo(
     )
     shown = np.where(np.asarray(picture.mask)[..., None] > 0, np.asarray(picture.color), 0.2)
     encoded = np.clip(shown / (1.2 * shown.max()), 0, 1) ** (1 / 2.2)
-    points = camera.project(y.pose(model.landmarks68(shape)))[:, :2]
+    points = camera.project(y.pose(prepare(model, 68).points(shape)))[:, :2]
     return encoded.astype(np.float32), np.asarray(points), y
