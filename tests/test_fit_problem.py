@@ -101,7 +101,8 @@ def test_a_start_that_does_not_fit_is_told(scene, fitted):
 def test_the_start_of_another_photo_is_in_its_units(scene, fitted):
     model, photo, points, _ = scene
     wider = (points[:, :2] - 48) * 1.1 + 48
-    other = working_photo(0.5 * fitted.photo, wider, size=64)
+    mask = np.ones(photo.shape[:2])
+    other = working_photo(0.5 * fitted.photo, wider, mask=mask, size=64)
     y = _fit._begun(fitted, model, other, FitOptions())
     sides = fitted.working.crop.side / other.crop.side
     assert sides < 0.95 and other.gain > 1.5 * fitted.working.gain
