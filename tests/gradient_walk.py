@@ -122,7 +122,7 @@ def is_host(function: Callable[..., Any]) -> bool:
     """Whether a function is NumPy's: some annotation of its signature allows its arrays alone."""
     for annotation in hints(function).values():
         kinds = [p for p in parts(annotation) if is_array(p) or p is np.ndarray]
-        if kinds and all(p is np.ndarray or p.array_type is np.ndarray for p in kinds):
+        if kinds and all(getattr(p, "array_type", p) is np.ndarray for p in kinds):
             return True
     return False
 

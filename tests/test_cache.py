@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
+import jaxface
 from jaxface.io.cache_folder import cache_dir
 from jaxface.run.compile_cache import enable_compilation_cache
 
@@ -76,3 +77,49 @@ def test_a_second_process_finds_the_first_ones_program(tmp_path: Path) -> None:
         for _ in range(2)
     ]
     assert hits[0] == 0 and hits[1] > 0
+
+
+CHILD = """
+import os, sys
+import jax
+jax.numpy.zeros(3).block_until_ready()  # JAX has begun before the cache is asked for
+{before}
+from jaxface.run.compile_cache import keep_compiled
+from jaxface.pipeline.fitting import _fit
+assert not sys.argv[1] or not os.path.exists(sys.argv[1]), "importing made a folder"
+try:
+    _fit.fit("there is no such photo")
+except FileNotFoundError:
+    pass
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.jit(lambda x: jax.numpy.sin(x) * 3)(1.0).block_until_ready()
+print(jax.config.values["jax_compilation_cache_dir"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("cache", "before", "used"),
+    [
+        ("kept", "", "kept"),
+        ("", "", None),
+        ("kept", "jax.config.update('jax_compilation_cache_dir', sys.argv[2])", "mine"),
+        ("kept", "jax.config.update('jax_enable_compilation_cache', False)", None),
+    ],
+)
+def test_a_fit_in_python_keeps_what_it_compiles(tmp_path, cache, before, used) -> None:
+    kept = str(tmp_path / cache) if cache else ""
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD.format(before=before), kept, str(tmp_path / "mine")],
+        env={**os.environ, "JAXFACE_CACHE": kept},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    folder = done.stdout.strip().splitlines()[-1]
+    if used is None:
+        assert folder == "None" and not list(tmp_path.iterdir())
+    else:
+        assert Path(folder).is_relative_to(tmp_path / used)
+        assert [path for path in Path(folder).iterdir() if path.name.startswith("jit_")]
+
+
+def test_the_name_is_public() -> None:
+    assert jaxface.enable_compilation_cache is enable_compilation_cache

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxface.energies.term import Term, compose
-from jaxface.solvers._gauss_newton import Problem, gauss_newton, posterior_covariance
+from jaxface.solvers import Problem, gauss_newton, posterior_covariance
 from jaxface.solvers._least_squares import least_squares
 from jaxface.solvers.solution import reason
 

@@ -23,7 +23,13 @@ from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.fitting.levels import compiling_levels, fit_levels
 from jaxface.run.clock import Clock
 from jaxface.run.compile_cache import keep_compiled
-from jaxface.stages.fit import WorkingPhoto, input_shapes, weights_as_data, working_photo
+from jaxface.stages.fit import (
+    WorkingPhoto,
+    in_units_of,
+    input_shapes,
+    weights_as_data,
+    working_photo,
+)
 from jaxface.stages.fit.options import FitOptions, FitOverrides
 from jaxface.stages.landmarks import detect_one
 
@@ -162,10 +168,7 @@ def _begun(
             )
     y = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), y, neutral)
     if isinstance(start, FittedFace):
-        closer = float(np.log(start.working.crop.side / working.crop.side))
-        brighter = float(working.gain / start.working.gain)
-        converted = (y.log_focal + closer, y.light * brighter)
-        y = eqx.tree_at(lambda p: (p.log_focal, p.light), y, converted)
+        y = in_units_of(working, y, start.working)
     if options.focal is not None:
         y = eqx.tree_at(lambda p: p.log_focal, y, working.data.log_focal)
     return y

@@ -13,8 +13,7 @@ import numpy as np
 from jaxface._compilation import quick_compilation
 from jaxface._types import Array, Float
 from jaxface.energies.term import Energy
-from jaxface.imaging.masks import dilate, fill_polygon
-from jaxface.models.landmark_schemes import CONTOURS, landmarks68
+from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.morphable import MorphableModel, SurfacePoints
 from jaxface.models.parameters import FaceParameters, set_apart
 from jaxface.run.clock import Clock
@@ -26,6 +25,7 @@ from jaxface.stages.fit import (
     FitStats,
     Posterior,
     WorkingPhoto,
+    brow_map,
     fit_energy,
     no_history,
     observe_finest,
@@ -126,9 +126,7 @@ class FittedFace:
         shown = self._once("skin", clock, _skin_program, rendered, data.image, data.mask)
         if len(self.landmarks) != 468:
             return np.asarray(shown)
-        # Brows differ from the model's more than any skin does, and yet belong to the face.
-        points = jnp.asarray(data.landmarks * self.size)
-        brows = self._once("brows", clock, _brow_program(self.size), points)
+        brows = self._once("brows", clock, _brow_program(self.size), data.landmarks)
         return np.maximum(np.asarray(shown), np.asarray(brows * data.mask * rendered.skin))
 
     def problem(
@@ -196,12 +194,7 @@ def _observing_program(config: FitConfig) -> Any:
 
 @functools.cache
 def _brow_program(size: int) -> Any:
-    def inside(points: Float[Array, "468 2"]) -> Array:
-        lines = [points[jnp.asarray(CONTOURS[f"{side} brow"])] for side in ("left", "right")]
-        filled = [fill_polygon(line, size, size) for line in lines]
-        return dilate(filled[0] | filled[1], size / 50)
-
-    return jax.jit(inside)
+    return jax.jit(functools.partial(brow_map, size=size))
 
 
 @functools.cache

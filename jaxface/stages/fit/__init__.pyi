@@ -4,7 +4,7 @@ from .batch import fit_batch
 from .levels import fit_parameters, level_stages, through_levels
 from .objective import fit_energy, weights_as_data
 from .options import FitOptions, FitOverrides
-from .photo import WorkingPhoto, input_shapes, working_photo
+from .photo import WorkingPhoto, in_units_of, input_shapes, working_photo
 from .prepared import FitModel, prepare
 from .records import (
     FitConfig,
@@ -15,7 +15,7 @@ from .records import (
     LevelRecord,
     no_history,
 )
-from .rendering import FitRender, fit_hidden_shading, render_fit, skin_map
+from .rendering import FitRender, brow_map, fit_hidden_shading, render_fit, skin_map
 from .self_shadow import with_self_shadow
 from .solve import fit_level, fit_shadows, observe, observe_finest
 from .start import fit_start
@@ -33,6 +33,7 @@ __all__ = [
     "LevelRecord",
     "Posterior",
     "WorkingPhoto",
+    "brow_map",
     "cast_shadows",
     "fit_batch",
     "fit_energy",
@@ -41,6 +42,7 @@ __all__ = [
     "fit_parameters",
     "fit_shadows",
     "fit_start",
+    "in_units_of",
     "input_shapes",
     "level_stages",
     "no_history",

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from jaxface._types import Float
 from jaxface.imaging.crop import Crop, crop_face
 from jaxface.models.face_oval import face_oval_mask
 from jaxface.models.landmark_schemes import CONTOURS, INNER_68, MEDIAPIPE_TO_IBUG68
+from jaxface.models.parameters import FaceParameters
 from jaxface.stages.fit.records import FitInput
 
 OUTER_EYE_CORNERS = {68: (36, 45), 468: (33, 263)}
@@ -151,3 +153,20 @@ def working_photo(
         estimate_inliers=jnp.asarray(estimate_inliers and mask is None),
     )
     return WorkingPhoto(data, crop, gain)
+
+
+def in_units_of(working: WorkingPhoto, y: FaceParameters, of: WorkingPhoto) -> FaceParameters:
+    """The unknowns of one photo's fit in the units of another photo by the same camera.
+
+    The focal length stays in pixels of the photo, the light in the photo's own linear values, and
+    the head where it is before the camera.
+
+    Args:
+        working: the other photo.
+        y: unknowns of the fit.
+        of: the photo that was fitted.
+    """
+    closer = float(np.log(of.crop.side / working.crop.side))
+    brighter = float(working.gain / of.gain)
+    converted = (y.log_focal + closer, y.light * brighter)
+    return eqx.tree_at(lambda p: (p.log_focal, p.light), y, converted)

@@ -7,8 +7,9 @@ from jaxface._numerics import safe_norm
 from jaxface._types import Array, Bool, Float
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
-from jaxface.imaging.masks import smoothstep
+from jaxface.imaging.masks import dilate, fill_polygon, smoothstep
 from jaxface.imaging.resample import resize
+from jaxface.models.landmark_schemes import CONTOURS
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.render._interpolate import interpolate
@@ -86,3 +87,16 @@ def skin_map(
     smooth = resize(shares, size, size)
     share = smooth[..., 0] / jnp.maximum(smooth[..., 1], 1e-6)
     return smoothstep(share, 0.35, 0.65) * mask * rendered.skin
+
+
+def brow_map(landmarks: Float[Array, "468 2"], size: int) -> Bool[Array, "s s"]:
+    """Pixels of the brows, which differ from the model's more than any skin, yet are of the face.
+
+    Args:
+        landmarks: of the face mesh, as fractions of the side.
+        size: side, px.
+    """
+    points = landmarks * size
+    lines = [points[jnp.asarray(CONTOURS[f"{side} brow"])] for side in ("left", "right")]
+    filled = [fill_polygon(line, size, size) for line in lines]
+    return dilate(filled[0] | filled[1], size / 50)
