@@ -19,6 +19,10 @@ database_app = typer.Typer(no_args_is_help=True, help="Texture databases: list, 
 features_app = typer.Typer(no_args_is_help=True, help="Feature networks of the texture statistics.")
 
 
+FeaturesOption = Annotated[
+    str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")
+]
+
 _SOURCES = {name: options.TEXTURE[name] for name in ("database", "features")}
 
 
@@ -56,7 +60,7 @@ def texture(
 def synthesise(
     picture: Annotated[Path, typer.Argument(help="Picture of a texture, all of it.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")],
-    features: FeaturesOption = "random",
+    features: FeaturesOption = DigitizeOptions.features,
     size: Annotated[
         str | None, typer.Option("--size", help="Side, or HEIGHTxWIDTH, px; as the picture's.")
     ] = None,
@@ -233,9 +237,7 @@ def database_build(
 @database_app.command("precompute")
 def database_precompute(
     path: Annotated[Path, typer.Argument(help="Folder of a database.")],
-    features: Annotated[
-        str, typer.Option("--features", help="random, trained, vgg16, vgg19, or a file of weights.")
-    ] = DigitizeOptions.features,
+    features: FeaturesOption = DigitizeOptions.features,
     resolution: Annotated[
         int | None,
         typer.Option("--resolution", help="Texels along a side; as photos are compared at."),

@@ -1,5 +1,6 @@
 """A database of textures from a folder of photos, as Saito 2017 (section 6) made theirs."""
 
+import dataclasses
 import os
 import re
 from collections.abc import Callable, Sequence
