@@ -53,8 +53,12 @@ def test_results_are_written_compared_and_judged(tmp_path: Path) -> None:
     assert "error (px)" in markdown(before) and "0.25" in markdown(before)
 
 
-def test_provenance_names_versions_and_no_machine() -> None:
+def test_provenance_names_versions_and_no_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("platform.node", "socket.gethostname", "socket.getfqdn", "getpass.getuser"):
+        monkeypatch.setattr(name, lambda *_: "secret")
+    monkeypatch.setenv("USER", "secret")
     found = provenance(["jax", "no-such-package"])
+    assert "secret" not in json.dumps(found)
     assert (
         found["versions"]["jax"] == jax.__version__ and "no-such-package" not in found["versions"]
     )

@@ -10,6 +10,23 @@ from jaxface.stages.landmarks import detect_faces
 from jaxface.stages.scan._embed_landmarks import embed_landmarks, with_landmarks
 
 
+def test_two_views_find_most_of_the_bundled_landmarks():
+    model = load_bundled("makehuman")
+    bare = eqx.tree_at(lambda m: (m.landmarks68, m.landmarks468), model, (None, None))
+    found = embed_landmarks(bare, yaws=(0.0, 15.0))
+    assert found.views == len(found.pictures) == 2
+    assert model.landmarks468 is not None and model.landmarks68 is not None
+    distance = np.linalg.norm(
+        np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1
+    )
+    assert np.median(distance) < 2.0  # 1.26 mm measured
+    assert np.median(found.spread) < 1.4  # 0.83
+    complete = with_landmarks(bare, found.points)
+    assert complete.landmarks68 is not None
+    inner = np.asarray(complete.landmarks68(model.mean) - model.landmarks68(model.mean))[17:]
+    assert np.median(np.linalg.norm(inner, axis=1)) < 1.6  # 0.98
+
+
 @pytest.mark.slow
 def test_finds_the_bundled_landmarks_again():
     model = load_bundled("makehuman")

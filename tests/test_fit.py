@@ -97,8 +97,8 @@ def test_recovers_the_shape(model, known, fitted):
     y = fitted[3]
     found = model.shape(y.identity, y.expression)
     mean_face = _error(model, model.mean, truth)
-    assert _error(model, found, truth) < 0.5 * mean_face
-    assert _error(model, found, truth) < 1.2
+    assert mean_face > 1.2
+    assert _error(model, found, truth) < 0.5  # 0.30 mm measured, of 1.41 of the mean face
 
 
 def test_recovers_the_picture(known, fitted):
@@ -106,7 +106,7 @@ def test_recovers_the_picture(known, fitted):
     shown = draw(y, models[-1], working.data.principal, SIZE)
     skin = np.asarray(shown.skin) & (np.asarray(working.data.mask) > 0.5)
     residual = np.linalg.norm(np.asarray(shown.color - working.data.image), axis=-1)[skin]
-    assert np.median(residual) < 0.05
+    assert np.median(residual) < 0.007  # 0.0034 measured
 
 
 def test_energy_falls_within_every_level(fitted):

@@ -1,10 +1,13 @@
 """Long columns to short ones: distances stay."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxface.solvers.simplex import reduction
 from jaxface.solvers.simplex.reduction import _turned, reduced, triangular_factor
 
 
@@ -86,10 +89,17 @@ def test_few_long_directions_are_turned_not_divided():
 
 
 def test_threads_change_no_digit(monkeypatch):
-    found = []
+    found, asked = [], []
+
+    def executor(threads):
+        asked.append(threads)
+        return ThreadPoolExecutor(threads)
+
+    monkeypatch.setattr(reduction, "ThreadPoolExecutor", executor)
     for threads in (1, 3):
-        monkeypatch.setattr("os.cpu_count", lambda threads=threads: threads)
+        monkeypatch.setattr(reduction, "usable_cores", lambda threads=threads: threads)
         found.append(triangular_factor(block_reader(columns("few long"), 97), 12))
+    assert sorted(set(asked)) == [1, 3]
     np.testing.assert_array_equal(*found)
 
 

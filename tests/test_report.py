@@ -139,7 +139,11 @@ def test_atomic_path_replaces_or_leaves(tmp_path: Path) -> None:
     assert list(target.parent.iterdir()) == [target]
 
 
-def test_environment_names_no_machine() -> None:
+def test_environment_names_no_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("platform.node", "socket.gethostname", "socket.getfqdn", "getpass.getuser"):
+        monkeypatch.setattr(name, lambda *_: "secret")
+    monkeypatch.setenv("USER", "secret")
     found = environment(["jax"])
+    assert "secret" not in json.dumps(found)
     assert set(found["versions"]) == {"python", "jax"} and found["cores"] >= 1
     assert "node" not in found and "hostname" not in found
