@@ -5,9 +5,9 @@ from .pipeline._digitize import digitize
 from .pipeline.databases.from_photos import build_database
 from .pipeline.fitting._fit import fit
 from .pipeline.fitting.outputs import save_fit
+from .pipeline.fitting.partial import texture
 from .pipeline.texture._complete import complete
 from .pipeline.texture.folder import complete_folder
-from .pipeline.texture.partial import texture
 from .run.compile_cache import enable_compilation_cache
 from .stages.fit import FitOptions, FitWeights
 from .stages.landmarks import detect_faces

@@ -72,7 +72,7 @@ def test_mistakes_end_with_code_2_and_one_line(tmp_path, arguments, said):
         (("--database", "nowhere"), "nowhere is no texture database"),
         (("--features", "nobody"), "no feature weights at nobody"),
         (("--resolution", "100"), "resolution is 100"),
-        (("--iterations", "0"), "iterations 0"),
+        (("--iterations", "0"), "iterations is 0"),
     ],
 )
 def test_a_completion_that_cannot_be_is_told_before_the_fit(tmp_path, arguments, said):

@@ -272,13 +272,9 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
     assert not cycle(graph)
 
 
-# Journeys that still call each other.
-NOT_YET = {("pipeline",)}
-
-
 @pytest.mark.parametrize(
     "folder",
-    sorted({package_of(path) for path in MODULES} - NOT_YET),
+    sorted({package_of(path) for path in MODULES}),
     ids=lambda folder: ".".join(("jaxface", *folder)),
 )
 def test_rooms_of_a_folder_have_an_order(folder) -> None:

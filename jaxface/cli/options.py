@@ -9,8 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxface import FitWeights
-from jaxface.pipeline import FitOptions
+from jaxface.pipeline import FitOptions, FitWeights
 from jaxface.pipeline.options import DigitizeOptions
 from jaxface.pipeline.texture.options import CompletionOptions, parse_detail
 

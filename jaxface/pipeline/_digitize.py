@@ -14,6 +14,7 @@ from jaxface.io.formats.landmark_file import read_landmarks
 from jaxface.models.morphable import MorphableModel
 from jaxface.pipeline.fitting._fit import FittedFace, fit
 from jaxface.pipeline.fitting.outputs import save_fit
+from jaxface.pipeline.fitting.partial import texture
 from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
 from jaxface.pipeline.photo import DEMO, open_photo, read_mask
 from jaxface.pipeline.texture.folder import (
@@ -24,7 +25,6 @@ from jaxface.pipeline.texture.folder import (
     open_inputs,
     silent,
 )
-from jaxface.pipeline.texture.partial import texture
 from jaxface.run.clock import Clock
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import re
 import traceback
-import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, Unpack
@@ -15,9 +14,9 @@ from jaxface.io.file_lock import claimed
 from jaxface.pipeline import _digitize as one
 from jaxface.pipeline.fitting._fit import FittedFace
 from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
+from jaxface.pipeline.photo import in_order
 from jaxface.pipeline.texture.folder import WORK_FOLDER, OnStep, silent
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr")
 LOCKS = ".locks"
 """folder, among the results, of the locks of the photos that are worked on"""
 
@@ -56,24 +55,6 @@ class PhotoWork(Protocol):
         ...
 
 
-def photos_in(folder: str | os.PathLike[str]) -> list[Path]:
-    """The photos of a folder, hidden files aside, in the order of their names.
-
-    The order is that of the letters' code points, the same on every machine.
-
-    Raises:
-        ValueError: it holds none.
-    """
-    found = [
-        path
-        for path in Path(folder).iterdir()
-        if path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
-    ]
-    if not found:
-        raise ValueError(f"folder {folder} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
-    return sorted(found, key=_order)
-
-
 def shard_of(photos: Sequence[Path], shard: str) -> list[Path]:
     """The photos of one shard: with ``3/8`` the 3rd, 11th, 19th ... in the order of their names.
 
@@ -94,7 +75,7 @@ def shard_of(photos: Sequence[Path], shard: str) -> list[Path]:
     if not 1 <= number <= count:
         raise ValueError(f"shard is {shard!r}; needed is K/N with K from 1 to N, as 3/8")
     folders_of(photos, ".")
-    return sorted(photos, key=_order)[number - 1 :: count]
+    return sorted(photos, key=in_order)[number - 1 :: count]
 
 
 def folders_of(photos: Sequence[Path], out: str | os.PathLike[str]) -> list[Path]:
@@ -258,8 +239,3 @@ def _absolute(options: DigitizeOptions) -> DigitizeOptions:
         if value is not None and str(value) not in names and Path(value).exists():
             found[key] = str(Path(value).absolute())
     return dataclasses.replace(options, **found)
-
-
-def _order(photo: Path) -> str:
-    # Some file systems take names apart into letters and accents, others put them together.
-    return unicodedata.normalize("NFC", photo.name)

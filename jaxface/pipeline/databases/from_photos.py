@@ -19,8 +19,8 @@ from jaxface.io.texture_database import INDEX, TextureDatabase, check_name
 from jaxface.models.morphable import MorphableModel
 from jaxface.pipeline.databases.photo_fits import BuildStep, FittedPhoto, fit_photos
 from jaxface.pipeline.fitting._detail_levels import detail_levels
-from jaxface.pipeline.folder import photos_in
-from jaxface.pipeline.texture.partial import texture
+from jaxface.pipeline.fitting.partial import texture
+from jaxface.pipeline.photo import photos_in
 from jaxface.stages._common_light import lit_vertices, shared_light
 from jaxface.stages.fit import with_self_shadow
 from jaxface.stages.fit.options import FitOptions, FitOverrides

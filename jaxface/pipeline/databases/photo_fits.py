@@ -14,8 +14,9 @@ from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.digest import digest
 from jaxface.io.fit_file import SavedFit, read_fit, write_fit
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.fitting._fit import as_photo, fit
+from jaxface.pipeline.fitting._fit import fit
 from jaxface.pipeline.fitting.fitted_face import FittedFace
+from jaxface.pipeline.photo import as_photo
 from jaxface.stages.fit import FitModel, working_photo
 from jaxface.stages.fit.options import FitOptions
 from jaxface.stages.texture.specularity import lips, without_specularity

@@ -13,7 +13,7 @@ import numpy as np
 from jaxface._types import Float, PyTree
 from jaxface.imaging.colour import srgb_to_linear
 from jaxface.io.face_models import load_model
-from jaxface.io.formats.image import Photo, read_image
+from jaxface.io.formats.image import Photo
 from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import PARAMETER_NAMES, FaceParameters, neutral_parameters
@@ -21,6 +21,7 @@ from jaxface.pipeline.fitting._detail_levels import prepared_levels
 from jaxface.pipeline.fitting.faults import check_finite
 from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.fitting.levels import compiling_levels, fit_levels
+from jaxface.pipeline.photo import as_photo
 from jaxface.run.clock import Clock
 from jaxface.run.compile_cache import keep_compiled
 from jaxface.stages.fit import (
@@ -32,30 +33,6 @@ from jaxface.stages.fit import (
 )
 from jaxface.stages.fit.options import FitOptions, FitOverrides
 from jaxface.stages.landmarks import detect_one
-
-
-def as_photo(photo: str | os.PathLike[str] | Photo | np.ndarray) -> Photo:
-    """A photo from a file or an array (``uint8`` or sRGB-encoded floats in [0, 1]).
-
-    Raises:
-        ValueError: an array that is not (h, w, 3) of one of these kinds, or has NaN.
-        FileNotFoundError: there is no such file.
-    """
-    if isinstance(photo, Photo):
-        return photo
-    if not isinstance(photo, np.ndarray):
-        return read_image(photo)
-    if photo.ndim != 3 or photo.shape[2] != 3:
-        raise ValueError(f"the photo has shape {photo.shape}; (height, width, 3) RGB is needed")
-    if photo.dtype == np.uint8:
-        pixels = photo.astype(np.float32) / 255
-    elif np.issubdtype(photo.dtype, np.floating):
-        pixels = photo.astype(np.float32)
-        if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() > 1:
-            raise ValueError("a photo of floats needs finite sRGB-encoded values from 0 to 1")
-    else:
-        raise ValueError(f"the photo is {photo.dtype}; uint8 or floats in [0, 1] are needed")
-    return Photo(pixels, None, None, "array")
 
 
 def fit(

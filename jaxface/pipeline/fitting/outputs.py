@@ -19,7 +19,7 @@ from jaxface.io.pictures.fit_sheet import fit_sheet
 from jaxface.io.pictures.report import write_report
 from jaxface.models.morphable import MorphableModel
 from jaxface.pipeline.fitting.fitted_face import FittedFace
-from jaxface.pipeline.texture.partial import Texture
+from jaxface.pipeline.fitting.partial import Texture
 from jaxface.run.clock import Clock
 from jaxface.run.environment import environment
 
