@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float, PyTree
 
 
@@ -89,7 +90,7 @@ class Energy(NamedTuple):
         def scaled(term: Term) -> PyTree:
             weight = term.weight_at(args)
             return jax.tree.map(
-                lambda r: jnp.sqrt(jnp.asarray(weight, r.dtype)) * r, term.fn(y, args)
+                lambda r: safe_sqrt(jnp.asarray(weight, r.dtype)) * r, term.fn(y, args)
             )
 
         return {term.name: scaled(term) for term in self.terms}

@@ -39,6 +39,11 @@ def pose_from_landmarks(
     x = points - centre
     gram = (x * share[:, None]).T @ x
     gram = gram + 1e-6 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
+    # Of points that coincide no more than rounding is left: any pose is theirs.
+    least = (16 * jnp.finfo(x.dtype).eps) ** 2 * jnp.sum(share[:, None] * points * points)
+    gram = jnp.where(
+        jnp.trace(gram) > jax.lax.stop_gradient(least), gram, jnp.eye(3, dtype=x.dtype)
+    )
     flip = jnp.array([1.0, -1.0], target.dtype)
     observed = (target - principal) * flip / focal
     stretch = jnp.ones(points.shape[0], points.dtype)

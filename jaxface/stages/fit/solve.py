@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import safe_norm, safe_normalize
 from jaxface._types import Array, Float, Int
 from jaxface.energies._photometric_quadratic import normal_modes, photometric_quadratic
 from jaxface.energies.landmark import LandmarkData, landmark_difference, landmark_residual
@@ -33,7 +33,7 @@ from jaxface.solvers.solution import Solution
 from jaxface.stages.fit._cast_shadows import cast_shadows, shadow_trust
 from jaxface.stages.fit.contour import slide_contour
 from jaxface.stages.fit.inliers import inlier_weights
-from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.prepared import FitModel, in_precision_of
 from jaxface.stages.fit.records import (
     FitConfig,
     FitData,
@@ -97,6 +97,7 @@ def fit_start(
     data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
 ) -> tuple[FaceParameters, LevelRecord]:
     """Before the first level: pose and coefficients from the landmarks, light in closed form."""
+    data, weights = in_precision_of(model, (data, weights))
     y, record = fit_landmarks(data, model, weights, config)
     image, mask, _ = level_image(data, len(config.steps), 0, level_side(data, config, 0))
     return initial_light(y, image, mask, data, model), record
@@ -112,6 +113,7 @@ def fit_shadows(
     level: int,
 ) -> tuple[FaceParameters, Float[Array, "n 9"], Float[Array, "n 3 9"]]:
     """Light, the transfer of its cast shadows, and its slope, from the fit of the level before."""
+    y, data = in_precision_of(model, (y, data))
     image, mask, _ = level_image(data, len(config.steps), level, level_side(data, config, level))
     return cast_shadows(
         y, image, mask, data, model, coarsest.model, directions=config.shadow_directions
@@ -139,6 +141,7 @@ def fit_level(
         level: may be traced, so that levels of one mesh share a program.
         canvas: side (px) that the level's image is filled up to, at least its own.
     """
+    y, data, weights = in_precision_of(model, (y, data, weights))
     energy = fit_energy(None, config.extra_terms)
     problem = Problem(
         energy=energy.value,
@@ -239,7 +242,7 @@ def landmark_trust(y: FaceParameters, power: float | Float[Array, ""]) -> Float[
 
     On renders of known faces the detector's error is 1.4 times as large at 40 degrees as at 20.
     """
-    to_camera = -y.translation / safe_norm(y.translation)
+    to_camera = -safe_normalize(y.translation)
     front = rotation_matrix(y.rotation)[:, 2] @ to_camera  # +z of the model comes out of the face
     return jnp.clip(front / TURNED, 0.1, 1.0) ** power
 
@@ -315,7 +318,7 @@ def initial_light(
     rotation = rotation_matrix(y.rotation)
     normal = vertex_normals(shape, model.model.faces) @ rotation.T
     posed = y.pose(shape)
-    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
+    view = -safe_normalize(posed)
     facing = jnp.maximum(jnp.sum(normal * view, axis=-1) - 0.2, 0.0)
     screen = y.camera(data.principal, size).project(posed)[:, :2]
     seen = bilinear(jnp.concatenate([image, mask[..., None]], axis=-1), screen)
