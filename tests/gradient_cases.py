@@ -32,7 +32,7 @@ from jaxface.networks.texture_features.tiles import sum_over_tiles, tile_of_map
 from jaxface.render._rasterize import rasterize
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitData, FitInput, FitWeights
-from jaxface.stages.fit.solve import fit_energy, observe
+from jaxface.stages.fit.solve import fit_energy, initial_light, observe
 from jaxface.stages.fit.visible import visible_samples
 from jaxface.stages.texture._synthesise import SynthesisWeights
 from tests.gradient_walk import Maker
@@ -451,6 +451,14 @@ simple(
     singular="zero is no rotation, and zero is near to no rotation",
 )  # fmt: skip
 
+simple(
+    "stages.fit.solve.initial_light",
+    initial_light,
+    lambda m: {"y": parameters(), "image": m.numbers(SIDE, SIDE, 3), "data": fit_input(),
+               "mask": m.numbers(SIDE, SIDE), "model": fit_model()},
+    singular="nothing of the face is seen: its mean colour is of no pixel",
+)  # fmt: skip
+
 WEIGHTS = {
     "FitWeights": "stages.fit.solve.observe",
     "SynthesisWeights": "stages.texture._synthesise.synthesis_energy",
@@ -547,6 +555,9 @@ NOT_DIFFERENTIABLE = {
     "an algorithm of the convolution, which has the derivative": [
         "networks.convolution.winograd.winograd_conv3x3",
     ],
-    "gathers records": ["stages.fit.records.join_records"],
+    "gathers or casts records": [
+        "stages.fit.records.join_records",
+        "stages.fit.prepared.in_precision_of",
+    ],
 }
 """reason -> names"""

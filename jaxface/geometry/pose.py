@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_divide
 from jaxface._types import Array, Float
 from jaxface.geometry.nearest_rotation import rotation_change
 from jaxface.geometry.rotation import axis_angle
@@ -34,7 +35,7 @@ def pose_from_landmarks(
     Returns:
         Axis-angle rotation (radians) and translation (mm) to the camera's frame.
     """
-    share = weight / jnp.maximum(jnp.sum(weight), 1e-12)
+    share = safe_divide(weight, jnp.sum(weight))
     centre = share @ points
     x = points - centre
     gram = (x * share[:, None]).T @ x

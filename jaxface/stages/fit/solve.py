@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import safe_norm, safe_normalize
+from jaxface._numerics import safe_norm, safe_normalize, safe_sqrt
 from jaxface._types import Array, Float, Int
 from jaxface.energies._photometric_quadratic import normal_modes, photometric_quadratic
 from jaxface.energies.landmark import LandmarkData, landmark_difference, landmark_residual
@@ -81,7 +81,7 @@ def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
 
 def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
     def landmark(y: FaceParameters, d: FitData) -> Array:
-        return jnp.sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
+        return safe_sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
 
     def focal(y: FaceParameters, d: FitData) -> Array:
         return focal_residual(y, d.focal_prior)
