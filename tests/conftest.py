@@ -1,13 +1,47 @@
 """Shared set-up of the tests: the --slow switch, real data where present, Hypothesis profiles."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import jax
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def check_signatures() -> None:
+    """Check the types and shapes that a signature states, at each call (jaxtyping, beartype).
+
+    Where JAX takes arrays it takes NumPy's too, so both count as arrays. A test of what is raised
+    for wrong arguments passes wrong arguments: inside ``pytest.raises`` nothing is checked.
+    """
+    import jaxtyping
+    import numpy as np
+
+    import jaxface._types
+
+    jaxface._types.Array = jax.Array | np.ndarray  # type: ignore[misc, assignment]
+    jaxtyping.install_import_hook("jaxface", "beartype.beartype")
+    raises = pytest.raises
+
+    @contextlib.contextmanager
+    def unchecked(*args: Any, **options: Any) -> Iterator[Any]:
+        jaxtyping.config.update("jaxtyping_disable", True)
+        try:
+            with raises(*args, **options) as caught:
+                yield caught
+        finally:
+            jaxtyping.config.update("jaxtyping_disable", False)
+
+    pytest.raises = unchecked  # type: ignore[assignment]
+
+
+if os.environ.get("JAXFACE_TYPECHECK"):  # before any module of the package is imported
+    check_signatures()
 
 hypothesis.settings.register_profile("local", deadline=None, max_examples=25)
 hypothesis.settings.register_profile(

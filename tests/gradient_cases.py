@@ -13,26 +13,30 @@ from jaxface import energies, render, stages
 from jaxface._numerics import above_rounding
 from jaxface.energies.term import Term, compose
 from jaxface.geometry.camera import Pose
+from jaxface.geometry.nearest_rotation import rotation_change
 from jaxface.geometry.normal_stencil import NormalStencil, normal_derivative, normal_stencil
+from jaxface.geometry.rotation import rotation_matrices, rotation_matrix
 from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.masks import smoothstep
 from jaxface.imaging.mipmap import Mipmap, mipmap
+from jaxface.imaging.suv import remove_specular_peak
 from jaxface.models.face_oval import face_oval
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import FaceParameters
 from jaxface.models.skin.patch import patch_at
+from jaxface.models.skin.pigments import Density
 from jaxface.models.skin.regions import SkinFields
-from jaxface.networks.texture_features.network import FeatureNetwork
+from jaxface.networks.texture_features.network import FeatureNetwork, features
 from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.networks.texture_features.tiles import sum_over_tiles, tile_of_map
 from jaxface.render._rasterize import rasterize
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitData, FitInput, FitWeights
-from jaxface.stages.fit.solve import fit_energy, observe
+from jaxface.stages.fit.solve import fit_energy, initial_light, observe
 from jaxface.stages.fit.visible import visible_samples
 from jaxface.stages.texture._synthesise import SynthesisWeights
 from tests.gradient_walk import Maker
-from tests.small_scene import small_model, small_parameters, small_samples
+from tests.small_scene import small_model, small_parameters
 
 SIDE = 12
 """px of a rendered picture"""
@@ -69,21 +73,31 @@ def model() -> MorphableModel:
     )
 
 
+@functools.cache
 def parameters() -> FaceParameters:
     """The bump seen from the front, a little turned."""
     return small_parameters(model())
 
 
+@functools.cache
 def stencil() -> NormalStencil:
     """Of the bump's mesh."""
     return normal_stencil(np.asarray(model().faces), model().vertex_count)
 
 
+@functools.cache
 def samples() -> energies.PixelSamples:
-    """Pixels of a random photo of the bump, some unused."""
-    return small_samples(model(), parameters(), SIDE)
+    """Pixels of a random photo of the bump, near the middles of its triangles."""
+    rng, faces = np.random.default_rng(9), np.asarray(model().faces)
+    middle = np.asarray(screen())[faces, :2].mean(axis=1) / SIDE
+    return energies.PixelSamples(
+        jnp.asarray(middle), model().faces, jnp.asarray(rng.uniform(0.2, 0.8, (len(faces), 3))),
+        jnp.asarray(rng.uniform(0.2, 0.8, len(faces))),
+        jnp.array([0.48, 0.53]),
+    )  # fmt: skip
 
 
+@functools.cache
 def layout() -> UVLayout:
     """Texels of random triangles, some empty."""
     rng = np.random.default_rng(3)
@@ -96,12 +110,14 @@ def layout() -> UVLayout:
     )
 
 
+@functools.cache
 def network() -> FeatureNetwork:
     """Two blocks of three and four channels, in the present precision."""
     made = random_network(((1, 3), (1, 4)), seed=3)
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), made)
 
 
+@functools.cache
 def style() -> energies.StyleData:
     """Targets for both layers, with a weight for each."""
     rng = np.random.default_rng(5)
@@ -113,6 +129,7 @@ def style() -> energies.StyleData:
     return energies.StyleData(network(), targets)
 
 
+@functools.cache
 def landmarks() -> energies.LandmarkData:
     """Detected near where the bump's landmarks are."""
     rng, points = np.random.default_rng(2), model().landmarks68
@@ -123,6 +140,7 @@ def landmarks() -> energies.LandmarkData:
     )  # fmt: skip
 
 
+@functools.cache
 def fit_model() -> FitModel:
     """The bump prepared for a fit."""
     points = model().landmarks68
@@ -133,11 +151,13 @@ def fit_model() -> FitModel:
     )  # fmt: skip
 
 
+@functools.cache
 def fit_weights() -> FitWeights:
     """The defaults, as arrays."""
     return jax.tree.map(jnp.asarray, FitWeights())
 
 
+@functools.cache
 def fit_input() -> FitInput:
     """A random photo."""
     rng, data = np.random.default_rng(1), landmarks()
@@ -149,6 +169,7 @@ def fit_input() -> FitInput:
     )  # fmt: skip
 
 
+@functools.cache
 def fit_data() -> FitData:
     """What a step of a fit holds fixed."""
     return FitData(
@@ -158,6 +179,7 @@ def fit_data() -> FitData:
     )  # fmt: skip
 
 
+@functools.cache
 def pyramid() -> Mipmap:
     """Three levels."""
     return mipmap(jnp.asarray(np.random.default_rng(6).uniform(0.2, 0.8, (8, 9, 3))), 3)
@@ -191,6 +213,7 @@ def tables() -> dict[str, Any]:
     }  # fmt: skip
 
 
+@functools.cache
 def scene() -> dict[str, Any]:
     """Arguments of a renderer."""
     y = parameters()
@@ -203,6 +226,7 @@ def scene() -> dict[str, Any]:
     }
 
 
+@functools.cache
 def screen() -> Any:
     """The bump's vertices in a picture of ``SIDE`` px."""
     made = scene()
@@ -229,9 +253,37 @@ def simple(
     CASES[name] = lambda maker: Case(fn, make(maker), held, singular)
 
 
-def seen(screen: Any) -> Any:
+def nearest(height: int, width: int, cull: bool, near: float) -> Callable[[Any, Any], Any]:
+    """What ``render._rasterize._nearest`` does, for few triangles and in a line or two.
+
+    Which triangle is nearest has no derivative, and the z-buffer takes seconds to compile.
+    """
+    del cull
+
+    def look(screen: Any, faces: Any) -> Any:
+        y, x = jnp.divmod(jnp.arange(height * width), width)
+        pixel = jnp.stack([x, y], -1) + 0.5
+        corner = screen[faces] - jnp.pad(pixel, ((0, 0), (0, 1)))[:, None, None]
+        a, b, c = (corner[:, :, i] for i in range(3))
+        areas = [p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0] for p, q in ((b, c), (c, a), (a, b))]
+        total = areas[0] + areas[1] + areas[2]
+        share = jnp.stack(areas, -1) / jnp.where(total == 0, 1.0, total)[..., None]
+        depth = jnp.sum(share * corner[..., 2], -1)
+        inside = jnp.all(share > 0, -1) & (total != 0) & jnp.all(corner[..., 2] > near, -1)
+        found = jnp.argmin(jnp.where(inside, depth, jnp.inf), 1)
+        return jnp.where(jnp.any(inside, 1), found, -1).reshape(height, width)
+
+    return look
+
+
+def on_screen(place: Any, depth: Any) -> Any:
+    """Vertices as ``Camera.project`` gives them; px and mm are apart, as their sizes are."""
+    return jnp.concatenate([place, depth[:, None]], axis=1)
+
+
+def seen(place: Any, depth: Any) -> Any:
     """The bump rasterised."""
-    return rasterize(screen, model().faces, SIDE, SIDE)
+    return rasterize(on_screen(place, depth), model().faces, SIDE, SIDE)
 
 
 def two_terms() -> energies.Energy:
@@ -261,6 +313,7 @@ def stages_visible(image: Any) -> Any:
 
 
 IRLS = "weights of the reweighting are constants of a step"
+LEVEL = "the mipmap's level is held; test_unwrap takes differences where it is the finest"
 VISIBLE = "what is visible, and which pixels count, is chosen and held"
 
 simple("_numerics.above_rounding", above_rounding,
@@ -268,12 +321,19 @@ simple("_numerics.above_rounding", above_rounding,
        singular="what is left over by rounding is cut, with its derivative")  # fmt: skip
 simple("imaging.masks.smoothstep", smoothstep,
        lambda m: {"x": m.numbers(5), "start": jnp.array(0.1), "stop": jnp.array(0.9)})  # fmt: skip
+simple("imaging.suv.remove_specular_peak", remove_specular_peak,
+       lambda m: {"rgb": m.numbers(9, 10, 3), "source_colour": m.numbers(3)})  # fmt: skip
 simple("imaging.mipmap.Mipmap.trilinear", Mipmap.trilinear, lambda m: {
     "self": pyramid(), "points": 8 * m.numbers(7, 2), "level": 3 * m.numbers(7) - 0.7})  # fmt: skip
-simple("render._rasterize.barycentrics",
-       lambda screen: render.barycentrics(screen, model().faces, seen(screen).triangle),
-       lambda m: {"screen": screen()})  # fmt: skip
-simple("render._rasterize.rasterize", lambda screen: seen(screen), lambda m: {"screen": screen()})
+simple(
+    "render._rasterize.barycentrics",
+    lambda place, depth: render.barycentrics(
+        on_screen(place, depth), model().faces, seen(place, depth).triangle
+    ),
+    lambda m: {"place": screen()[:, :2], "depth": screen()[:, 2]},
+)
+simple("render._rasterize.rasterize", seen,
+       lambda m: {"place": screen()[:, :2], "depth": screen()[:, 2]})  # fmt: skip
 simple("render.image.render", sized(render.render),
        lambda m: {**scene(), "albedo": m.numbers(25, 3)})  # fmt: skip
 simple("render.image.render_textured", sized(render.render_textured), lambda m: {
@@ -288,7 +348,7 @@ simple("stages._unwrap.unwrap", stages.unwrap, lambda m: {
     **{k: v for k, v in scene().items() if k != "pose"},
     "vertices": scene()["pose"](scene()["vertices"]), "photo": m.numbers(SIDE, SIDE, 3),
     "mask": jnp.ones((SIDE, SIDE)), "layout": layout(), "hidden": -0.1 * m.numbers(25, 3)},
-    camera="")  # fmt: skip
+    camera=LEVEL, layout=LEVEL, vertices=LEVEL)  # fmt: skip
 
 simple("networks.texture_features.tiles.tile_of_map", lambda values: tile_of_map(
     values, "conv2_1", jnp.array([1, 0]), 4), lambda m: {"values": m.numbers(3, 3, 2)})  # fmt: skip
@@ -340,10 +400,11 @@ simple("energies.term.sum_of_squares", energies.sum_of_squares,
 simple("stages._common_light.lit_vertices", stages.lit_vertices, lambda m: {
     "y": parameters(), "model": model(), "image": m.numbers(SIDE, SIDE, 3),
     "mask": m.numbers(SIDE, SIDE), "principal": jnp.array([0.5, 0.5])})  # fmt: skip
-simple("stages._common_light.common_light", functools.partial(stages.common_light, rounds=3),
+simple("stages._common_light.common_light", functools.partial(stages.common_light, rounds=2),
        lambda m: {"photos": stages.LitVertices(m.numbers(2, 25, 3), m.numbers(2, 25, 9),
                                                m.numbers(2, 25)),
-                  "mean": m.numbers(25, 3), "basis": 0.1 * m.numbers(25, 3, 2)})  # fmt: skip
+                  "mean": m.numbers(25, 3), "basis": 0.1 * m.numbers(25, 3, 2)},
+       singular="gains of what has no colour are bounded by a tiny number")  # fmt: skip
 simple("stages.fit._posterior.posterior", lambda root, model, weight: stages.posterior(
     root @ root.T + jnp.eye(len(root)), model, weight), lambda m: {
     "root": m.numbers(10, 10), "model": model(), "weight": m.numbers()})  # fmt: skip
@@ -370,16 +431,52 @@ simple(
     },
 )
 
+simple("geometry.rotation.rotation_matrices", rotation_matrices,
+       lambda m: {"axis_angle": m.numbers(4, 3)})  # fmt: skip
+simple("models.skin.pigments.Density.plus", lambda one, other: one.plus(other),
+       lambda m: {"one": Density(*m.numbers(3, 4)), "other": Density(*m.numbers(3, 4))},
+)  # fmt: skip
+
+simple(
+    "networks.texture_features.network.features",
+    lambda network, image: features(network, image, ("conv1_1", "conv2_1")),
+    lambda m: {"network": network(), "image": m.numbers(6, 7)},
+)
+
+simple(
+    "geometry.nearest_rotation.rotation_change",
+    rotation_change,
+    lambda m: {"rotation": rotation_matrix(m.numbers(3)), "matrix": m.numbers(3, 3),
+               "change": m.numbers(3, 3)},
+    singular="zero is no rotation, and zero is near to no rotation",
+)  # fmt: skip
+
+simple(
+    "stages.fit.solve.initial_light",
+    initial_light,
+    lambda m: {"y": parameters(), "image": m.numbers(SIDE, SIDE, 3), "data": fit_input(),
+               "mask": m.numbers(SIDE, SIDE), "model": fit_model()},
+    singular="nothing of the face is seen: its mean colour is of no pixel",
+)  # fmt: skip
+
 WEIGHTS = {
     "FitWeights": "stages.fit.solve.observe",
     "SynthesisWeights": "stages.texture._synthesise.synthesis_energy",
-    "StyleTargets": "energies._gram.style_energy",
 }
 """records of weights, and the case that walks their fields"""
 
-ELSEWHERE = {
-    "FitWeights": "test_fit.py and test_differentiable.py: through the solver as well",
+POSITIVE = (
+    "focal", "texel", "unit", "deviation", "['stop']", "['args'][1]", "spacing", "['width']",
+)  # fmt: skip
+"""parts of the names of arguments that are positive by what they mean, and divided by"""
+
+SLOW = {
+    "render.image.render_textured",
+    "stages._unwrap.unwrap",
+    "energies._photometric_quadratic.photometric_jacobian",
+    "energies._photometric_quadratic.photometric_quadratic",
 }
+"""what takes long to compile; rendering and unwrapping have tests of their own besides"""
 
 NOT_DIFFERENTIABLE = {
     "by the implicit function theorem, against differences in test_fit and test_differentiable": [
@@ -402,8 +499,28 @@ NOT_DIFFERENTIABLE = {
         "networks.landmarks.face_mesh.symmetric_landmarks",
         "networks.landmarks.face_mesh.refine_landmarks",
     ],
-    "layers that are walked, each texel's summed; discontinuous where a run skips a layer": [
+    "paints a picture from hashed cells, with jumps between them; its traits are not fitted": [
         "models.skin.synthesis.synthesise_skin",
+        "models.skin.furrows.furrows",
+        "models.skin.hair.stubble",
+        "models.skin.hair.brows",
+        "models.skin.hair.scalp_roots",
+        "models.skin.hair.down",
+        "models.skin.lesions.freckles",
+        "models.skin.lesions.marks",
+        "models.skin.lips.lips",
+        "models.skin.mottling.mottling",
+        "models.skin.mottling.veins",
+        "models.skin.noise.uniforms",
+        "models.skin.noise.gradient_noise",
+        "models.skin.noise.visible",
+        "models.skin.noise.spectrum_noise",
+        "models.skin.pores.pores",
+        "models.skin.spots.gather_spots",
+        "models.skin.spots.soft_disc",
+        "models.skin.spots.stroke",
+        "models.skin.spots.likely",
+        "models.skin.wrinkles.wrinkles",
     ],
     "a choice that a step holds; its docstring says that no gradient passes": [
         "render._depth_buffer.depth_buffer",
@@ -438,6 +555,9 @@ NOT_DIFFERENTIABLE = {
     "an algorithm of the convolution, which has the derivative": [
         "networks.convolution.winograd.winograd_conv3x3",
     ],
-    "gathers records": ["stages.fit.records.join_records"],
+    "gathers or casts records": [
+        "stages.fit.records.join_records",
+        "stages.fit.prepared.in_precision_of",
+    ],
 }
 """reason -> names"""

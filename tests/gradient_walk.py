@@ -32,6 +32,9 @@ SIZES = {
 """of named axes; 4 where none is named"""
 
 
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
 class NoCaseError(LookupError):
     """No argument can be made from an annotation."""
 
@@ -150,7 +153,7 @@ class Maker:
         needed = {
             name: known[name]
             for name, parameter in signature.parameters.items()
-            if parameter.default is inspect.Parameter.empty
+            if parameter.default is inspect.Parameter.empty and parameter.kind not in VARIADIC
         }
         return {name: self.make(annotation, name) for name, annotation in needed.items()}
 

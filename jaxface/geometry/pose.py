@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_divide
 from jaxface._types import Array, Float
 from jaxface.geometry.nearest_rotation import rotation_change
 from jaxface.geometry.rotation import axis_angle
@@ -34,11 +35,16 @@ def pose_from_landmarks(
     Returns:
         Axis-angle rotation (radians) and translation (mm) to the camera's frame.
     """
-    share = weight / jnp.maximum(jnp.sum(weight), 1e-12)
+    share = safe_divide(weight, jnp.sum(weight))
     centre = share @ points
     x = points - centre
     gram = (x * share[:, None]).T @ x
     gram = gram + 1e-6 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
+    # Of points that coincide no more than rounding is left: any pose is theirs.
+    least = (16 * jnp.finfo(x.dtype).eps) ** 2 * jnp.sum(share[:, None] * points * points)
+    gram = jnp.where(
+        jnp.trace(gram) > jax.lax.stop_gradient(least), gram, jnp.eye(3, dtype=x.dtype)
+    )
     flip = jnp.array([1.0, -1.0], target.dtype)
     observed = (target - principal) * flip / focal
     stretch = jnp.ones(points.shape[0], points.dtype)

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jaxface._numerics import cross
+from jaxface._numerics import above_rounding, cross, safe_divide
 from jaxface._types import Array, Float
 
 
@@ -21,16 +21,17 @@ def ray_weights(
 
     Moeller & Trumbore, "Fast, minimum storage ray/triangle intersection", 1997. The weights are
     perspective-correct by construction, sum to one, and are differentiable in the ray and the
-    corners with the triangle held fixed. A triangle seen edge-on (determinant exactly zero)
-    gives the weights (1, 0, 0) with a zero derivative.
+    corners with the triangle held fixed. A triangle seen edge-on (a determinant of zero, to within
+    rounding) gives the weights (1, 0, 0) with a zero derivative.
     """
     a = corners[..., 0, :]
     edge1 = corners[..., 1, :] - a
     edge2 = corners[..., 2, :] - a
     p = cross(direction, edge2)
-    determinant = jnp.sum(edge1 * p, axis=-1)
-    flat = determinant == 0
-    inverse = jnp.where(flat, 0.0, 1.0 / jnp.where(flat, 1.0, determinant))
+    lengths = [jnp.max(jnp.abs(v), axis=-1) for v in (direction, edge1, edge2)]
+    size = lengths[0] * lengths[1] * lengths[2]
+    determinant = above_rounding(jnp.sum(edge1 * p, axis=-1, keepdims=True), size)[..., 0]
+    inverse = safe_divide(jnp.ones_like(determinant), determinant)
     w1 = -jnp.sum(a * p, axis=-1) * inverse
     w2 = -jnp.sum(direction * cross(a, edge1), axis=-1) * inverse
     return jnp.stack([1.0 - w1 - w2, w1, w2], axis=-1)

@@ -94,6 +94,9 @@ def similarity_transform(
     mean_source = w @ source
     mean_target = w @ target
     x, y = source - mean_source, target - mean_target
+    # Points that coincide leave differences behind that are no more than their rounding.
+    least = (16 * jnp.finfo(x.dtype).eps) ** 2 * jnp.sum(w[:, None] * source * source)
+    x = jnp.where(jnp.sum(w[:, None] * x * x) > jax.lax.stop_gradient(least), x, 0.0)
     moment = (w[:, None] * y).T @ x
     rotation = nearest_rotation(moment)
     scale = jnp.ones((), source.dtype)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import safe_norm, safe_normalize
 from jaxface._types import Array, Bool, Float
 from jaxface.geometry.mesh import vertex_normals
 from jaxface.geometry.rotation import rotation_matrix
@@ -101,7 +101,7 @@ def lit_vertices(
     unturned = vertex_normals(shape, model.faces)
     normal = unturned @ rotation.T
     posed = y.pose(shape)
-    cosine = -jnp.sum(normal * posed, axis=-1) / safe_norm(posed)
+    cosine = -jnp.sum(normal * safe_normalize(posed), axis=-1)
     camera = y.camera(principal, size)
     buffer = depth_buffer(posed, model.faces, camera, size, size, depth_size)
     screen = camera.project(posed)[:, :2]

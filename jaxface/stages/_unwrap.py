@@ -140,7 +140,7 @@ def _unwrap(
         screen = camera.project(point)
         face_normal = jnp.stack([column(18), column(19), column(20)], axis=-1)
         seen = buffer.unoccluded(point, face_normal)
-        cosine = -_dot(normal, point) * jax.lax.rsqrt(_dot(point, point))
+        cosine = -_dot(normal, point) * jax.lax.rsqrt(jnp.maximum(_dot(point, point), 1e-12))
         sample = pyramid.trilinear(screen[:, :2], jax.lax.stop_gradient(column(21)))
         cover = sample[:, 3]
         basis = sh_basis(normal)

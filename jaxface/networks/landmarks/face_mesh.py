@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import safe_arctan2, safe_norm
 from jaxface._types import Array, Float, Int
 from jaxface.imaging.resample import affine_crop
 from jaxface.networks.landmarks.blaze import Convolution, ResidualBlock, chain, read_chain
@@ -104,7 +104,7 @@ def region_from_eyes(
     """Region for a detected box, level with the subject's eyes."""
     across = left_eye - right_eye
     side = REGION_MARGIN * jnp.max(box[2:] - box[:2])
-    return Region((box[:2] + box[2:]) / 2, side, jnp.arctan2(across[1], across[0]))
+    return Region((box[:2] + box[2:]) / 2, side, safe_arctan2(across[1], across[0]))
 
 
 def region_from_landmarks(landmarks: Float[Array, "468 3"]) -> Region:
@@ -115,7 +115,7 @@ def region_from_landmarks(landmarks: Float[Array, "468 3"]) -> Region:
     points = landmarks[:, :2]
     right, left = (points[i] for i in _EYE_CORNERS)
     across = left - right
-    angle = jnp.arctan2(across[1], across[0])
+    angle = safe_arctan2(across[1], across[0])
     rotation = rotation_2d(angle)
     level = points @ rotation
     low, high = jnp.min(level, axis=0), jnp.max(level, axis=0)

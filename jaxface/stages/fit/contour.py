@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_normalize
 from jaxface._types import Array, Int
 from jaxface.energies.landmark import LandmarkData
 from jaxface.geometry.mesh import vertex_normals
@@ -43,7 +44,7 @@ def slide_contour(
     rotation = rotation_matrix(y.rotation)
     normals = vertex_normals(vertices, model.faces) @ rotation.T
     posed = vertices @ rotation.T + y.translation
-    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
+    view = -safe_normalize(posed)
     facing = jnp.sum(normals * view, axis=-1)
     own_facing = data.points(facing[:, None])[:, 0]
     hidden = own_facing[contour] < 0.05

@@ -8,6 +8,7 @@ makes the fit a redescending M-estimator on top of the unsquared norm of ``E_c``
 
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.imaging.masks import smoothstep
 
@@ -42,7 +43,7 @@ def inlier_weights(
     centre = _median(ratio[::stride], used[::stride])
     spread = 1.4826 * _median(jnp.abs(ratio[::stride] - centre), used[::stride])
     deviation = (ratio - centre) / jnp.maximum(spread, 0.05)
-    distance = jnp.sqrt(jnp.mean(deviation**2, axis=-1))
+    distance = safe_sqrt(jnp.mean(deviation**2, axis=-1))
     return jnp.where(jnp.sum(used) > 30, 1.0 - smoothstep(distance, accept, reject), 1.0)
 
 

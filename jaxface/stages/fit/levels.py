@@ -22,6 +22,9 @@ def fit_parameters(
 ) -> tuple[FaceParameters, FitStats]:
     """The whole fit as one pure function: jit it, vmap it over ``data``.
 
+    In the precision of the models: with those in double precision the fit is, wherever
+    `jax_enable_x64` is set.
+
     Args:
         data: working image and landmarks.
         models: the model at each level of detail, coarsest first, one for each pyramid level.

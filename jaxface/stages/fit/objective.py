@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
+from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies._photometric_quadratic import photometric_quadratic
 from jaxface.energies.landmark import landmark_residual
@@ -95,7 +95,7 @@ def _photo_value(y: FaceParameters, data: FitData) -> Float[Array, ""]:
 
 
 def _photo_residual(y: FaceParameters, data: FitData) -> Float[Array, "p 3"]:
-    return jnp.sqrt(data.photo_trust) * photometric_root_residual(y, data.photo)
+    return safe_sqrt(data.photo_trust) * photometric_root_residual(y, data.photo)
 
 
 def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
@@ -105,7 +105,7 @@ def _photo_quadratic(y: FaceParameters, data: FitData) -> Quadratic:
 
 def _geometric_terms(weights: FitWeights | None = None) -> list[Term]:
     def landmark(y: FaceParameters, d: FitData) -> Array:
-        return jnp.sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
+        return safe_sqrt(d.landmark_trust) * landmark_residual(y, d.landmark)
 
     def focal(y: FaceParameters, d: FitData) -> Array:
         return focal_residual(y, d.focal_prior)

@@ -1,10 +1,11 @@
 """What a fit needs of a morphable model at one level of detail, prepared once."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxface._types import Array, Bool, Float, Int
+from jaxface._types import Array, Bool, Float, Int, PyTree
 from jaxface.geometry.mesh import boundary_vertices
 from jaxface.geometry.normal_stencil import NormalStencil, normal_stencil
 from jaxface.models.landmark_schemes import FACE_OVAL, JAW_68
@@ -73,3 +74,13 @@ def prepare(model: MorphableModel, landmark_count: int) -> FitModel:
         vertex_mask=jnp.asarray(skin),
         face_mask=jnp.asarray(skin[faces].all(axis=1)),
     )
+
+
+def in_precision_of(model: FitModel, tree: PyTree) -> PyTree:
+    """The floating-point arrays of a pytree in the precision of a model.
+
+    A fit is computed in its model's precision, whatever that of the photo: what a loop carries
+    keeps its type. Numbers of Python stay as they are.
+    """
+    dtype = model.model.mean.dtype
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxface._numerics import safe_norm
+from jaxface._numerics import safe_norm, safe_normalize
 from jaxface._types import Array, Float, Int
 from jaxface.energies._photometric_quadratic import normal_modes
 from jaxface.energies.landmark import LandmarkData, landmark_difference
@@ -23,7 +23,7 @@ from jaxface.stages.fit._cast_shadows import cast_shadows, shadow_trust
 from jaxface.stages.fit.contour import slide_contour
 from jaxface.stages.fit.inliers import inlier_weights
 from jaxface.stages.fit.objective import fit_energy
-from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.prepared import FitModel, in_precision_of
 from jaxface.stages.fit.records import (
     FitConfig,
     FitData,
@@ -48,6 +48,7 @@ def fit_shadows(
     level: int,
 ) -> tuple[FaceParameters, Float[Array, "n 9"], Float[Array, "n 3 9"]]:
     """Light, the transfer of its cast shadows, and its slope, from the fit of the level before."""
+    y, data = in_precision_of(model, (y, data))
     image, mask, _ = level_image(data, len(config.steps), level, level_side(data, config, level))
     return cast_shadows(
         y, image, mask, data, model, coarsest.model, directions=config.shadow_directions,
@@ -76,6 +77,7 @@ def fit_level(
         level: may be traced, so that levels of one mesh share a program.
         canvas: side (px) that the level's image is filled up to, at least its own.
     """
+    y, data, weights = in_precision_of(model, (y, data, weights))
     energy = fit_energy(None, config.extra_terms, config.freeze)
     image, mask, side = level_image(data, len(config.steps), level, canvas)
     modes = normal_modes(y, model.model, model.stencil)
@@ -204,7 +206,7 @@ def landmark_trust(y: FaceParameters, power: float | Float[Array, ""]) -> Float[
 
     On renders of known faces the detector's error is 1.4 times as large at 40 degrees as at 20.
     """
-    to_camera = -y.translation / safe_norm(y.translation)
+    to_camera = -safe_normalize(y.translation)
     front = rotation_matrix(y.rotation)[:, 2] @ to_camera  # +z of the model comes out of the face
     return jnp.clip(front / TURNED, 0.1, 1.0) ** power
 

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxface._numerics import safe_normalize
 from jaxface._types import Array, Float
 from jaxface.energies.landmark import LandmarkData
 from jaxface.geometry.mesh import vertex_normals
@@ -14,7 +15,7 @@ from jaxface.render.occlusion import sh_rotation
 from jaxface.render.shading import sh_basis
 from jaxface.solvers._gauss_newton import Problem, gauss_newton
 from jaxface.stages.fit.objective import geometric_energy
-from jaxface.stages.fit.prepared import FitModel
+from jaxface.stages.fit.prepared import FitModel, in_precision_of
 from jaxface.stages.fit.records import FitConfig, FitInput, FitWeights, LevelRecord
 from jaxface.stages.fit.solve import (
     landmarks_at,
@@ -28,6 +29,7 @@ def fit_start(
     data: FitInput, model: FitModel, weights: FitWeights, config: FitConfig
 ) -> tuple[FaceParameters, LevelRecord]:
     """Before the first level: pose and coefficients from the landmarks, light in closed form."""
+    data, weights = in_precision_of(model, (data, weights))
     y, record = fit_landmarks(data, model, weights, config)
     image, mask, _ = level_image(data, len(config.steps), 0, level_side(data, config, 0))
     return initial_light(y, image, mask, data, model), record
@@ -103,7 +105,7 @@ def initial_light(
     rotation = rotation_matrix(y.rotation)
     normal = vertex_normals(shape, model.model.faces) @ rotation.T
     posed = y.pose(shape)
-    view = -posed / jnp.linalg.norm(posed, axis=-1, keepdims=True)
+    view = -safe_normalize(posed)
     facing = jnp.maximum(jnp.sum(normal * view, axis=-1) - 0.2, 0.0)
     screen = y.camera(data.principal, size).project(posed)[:, :2]
     seen = bilinear(jnp.concatenate([image, mask[..., None]], axis=-1), screen)

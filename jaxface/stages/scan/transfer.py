@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxface._numerics import safe_norm
 from jaxface._types import Array, Bool, Float
 from jaxface.geometry.closest_point import TriangleTree
 from jaxface.geometry.uv import UVLayout
@@ -49,7 +50,7 @@ def resample_texture(
     points = jnp.stack([place[..., 0] * width, (1.0 - place[..., 1]) * height], axis=-1)
 
     def step(axis: int) -> Float[Array, "r r"]:
-        ahead = jnp.linalg.norm(jnp.roll(points, -1, axis) - points, axis=-1)
+        ahead = safe_norm(jnp.roll(points, -1, axis) - points)
         ahead = jnp.where(inside & jnp.roll(inside, -1, axis), ahead, jnp.inf)
         least = jnp.minimum(ahead, jnp.roll(ahead, 1, axis))
         return jnp.where(jnp.isfinite(least), least, 1.0)
