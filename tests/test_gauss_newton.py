@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxface.energies.term import Term, compose
-from jaxface.solvers import Problem, gauss_newton, posterior_covariance
+from jaxface.solvers._gauss_newton import gauss_newton
 from jaxface.solvers._least_squares import least_squares
+from jaxface.solvers._posterior_covariance import posterior_covariance
+from jaxface.solvers.problem import Problem
 from jaxface.solvers.solution import reason
 
 
@@ -180,6 +182,21 @@ def test_posterior_of_a_linear_gaussian_model(x64):
     expected = np.linalg.inv(np.eye(4) + np.asarray(a.T @ a) / sigma**2)
     found = posterior_covariance(curvature, 2 * weight)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-7)
+
+
+def test_the_ridge_of_a_posterior_bounds_what_nothing_says(x64):
+    """Two unknowns of which only the sum is seen: variance 1 / ridge along the difference."""
+    found = posterior_covariance(jnp.ones((2, 2)), 2.0)
+    expected = np.linalg.inv(np.ones((2, 2)) + 1e-7 * np.eye(2))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_allclose(found, np.asarray(found).T, rtol=1e-12)
+
+
+def test_a_posterior_without_a_factor_gets_a_larger_ridge():
+    matrix = jnp.array([[1.0, 1.01], [1.01, 1.0]])  # an eigenvalue of -0.01
+    found = np.asarray(posterior_covariance(matrix, 2.0))
+    np.testing.assert_allclose(found, np.linalg.inv(matrix + 0.1 * np.eye(2)), rtol=1e-4)
+    assert (np.linalg.eigvalsh(found) > 0).all()
 
 
 def test_answers_are_differentiable_in_the_weights_of_terms(x64):

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from jaxface.solvers.jaxopt_import import NOTICE, jaxopt
 from jaxface.solvers.simplex._minimise_on_simplex import minimise_on_simplex, solve
+from jaxface.solvers.solution import reason
 
 REFERENCES = Path(__file__).parent / "data" / "simplex_references.npz"
 NORMS = ("frobenius", "squared")
@@ -279,6 +280,91 @@ def test_gradient_in_single_precision_and_under_vmap(references):
             lambda t: jnp.max(minimise_on_simplex(references["points"][0].astype(float), t).value)
         )(jnp.asarray(references["targets"][0], jnp.float64))
     np.testing.assert_allclose(mapped[0], exact, atol=2e-3 * np.abs(exact).max())
+
+
+def lattice(seed):
+    """Three points in five terms of two dimensions, on a grid: terms often vanish at the solution,
+    with all weights positive, where full primal-dual steps go round in circles."""
+    rng = np.random.default_rng(seed)
+    return np.round(2 * rng.normal(size=(3, 5, 2))), np.round(2 * rng.normal(size=(5, 2)))
+
+
+def small_problems(rng, count, shape):
+    """Random problems of one shape: in the hull, at a point, doubled points, ties, any scale."""
+    k, terms, m = shape
+    for number in range(count):
+        points, target = rng.normal(size=shape), rng.normal(size=shape[1:])
+        points *= np.exp(rng.normal(size=(k, 1, 1)))
+        match number % 8:
+            case 0:
+                target = np.einsum("k,klm->lm", rng.dirichlet(np.ones(k)), points)
+            case 1:
+                target = points[rng.integers(k)]
+            case 2:
+                points = points[rng.integers(0, max(1, k // 2), size=k)]
+            case 3:
+                points = points[:1] + rng.normal(size=(k, 1, 1)) * rng.normal(size=(1, terms, m))
+            case 4:
+                points, target = np.round(2 * points), np.round(2 * target)
+            case 5:
+                target[0] = np.einsum("k,km->m", rng.dirichlet(np.ones(k)), points[:, 0])
+            case 6:
+                points[:, 0], target[0] = 0.0, rng.integers(0, 2)
+        scale = 10.0 ** rng.integers(-9, 10)
+        yield points * scale, target * scale
+
+
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("shape", [(3, 5, 2), (6, 3, 3)], ids=str)
+def test_small_problems_converge_or_say_why(shape, norm, x64):
+    """A hundred of each; the certificate is that of independent arithmetic."""
+    made = [*small_problems(np.random.default_rng(8), 100, shape)]
+    points, targets = (np.stack(x) for x in zip(*made, strict=True))
+
+    @jax.jit
+    def all_of(points, targets):
+        return jax.lax.map(lambda data: solve(*data, norm=norm), (points, targets))
+
+    answers = all_of(points, targets)
+    assert np.all(answers.converged), answers.relative_gap[~np.asarray(answers.converged)]
+    for number, (p, t) in enumerate(made):
+        found = value(p, t, answers.weights[number], norm)
+        zero = 1e-11 * float(answers.scale[number])
+        np.testing.assert_allclose(answers.objective[number], found, rtol=1e-9, atol=zero)
+        assert answers.lower_bound[number] <= found * (1 + 1e-9) + zero
+
+
+@pytest.mark.parametrize("seed", [22, 233, 341])
+def test_terms_that_vanish_inside_the_simplex(seed, x64):
+    points, target = lattice(seed)
+    found = minimise_on_simplex(points, target)
+    assert found.converged, reason(found)
+    assert found.stats["relative_gap"] <= 1e-11
+
+
+def test_what_does_not_converge_says_how_far_it_came(references, x64):
+    points, target = references["points"][0].astype(float), references["targets"][0].astype(float)
+    found = minimise_on_simplex(points, target, norm="squared", method="projected_gradient")
+    assert not found.converged
+    assert reason(found).startswith("used all its steps; the certified gap is")
+    with jax.debug_nans(False):
+        points[2, 0, 0] = np.nan
+        broken = minimise_on_simplex(points, target)
+        assert not broken.converged and "not finite" in reason(broken)
+
+
+def test_derivative_with_more_positive_weights_than_are_usual(x64):
+    """Unit vectors: the projection onto the simplex, whose derivative is a centred identity."""
+    count = 300
+    target = np.full(count, 1.0 / count) + 1e-4 * np.random.default_rng(2).normal(size=count)
+    points, change = np.eye(count)[:, None], np.random.default_rng(3).normal(size=count)
+
+    def weights(target):
+        return minimise_on_simplex(points, target[None], norm="squared").value
+
+    found, forward = jax.jvp(weights, (jnp.asarray(target),), (change,))
+    assert np.sum(found > 0) == count
+    np.testing.assert_allclose(forward, change - change.mean(), atol=1e-8)
 
 
 def test_projected_gradient_certifies_what_it_reached(references, x64):

@@ -127,7 +127,7 @@ def cast_shadows(
         moment = jnp.einsum("pc,pj->cj", weight[:, None] * albedo * samples.color, lit)
         ridge = RIDGE * jnp.trace(gram, axis1=1, axis2=2)[:, None, None] / len(towards)
         gram = gram + ridge * jnp.eye(len(towards), dtype=gram.dtype)
-        return jax.vmap(nonnegative_least_squares)(gram, moment).T, None
+        return jax.vmap(nonnegative_least_squares)(gram, moment).value.T, None
 
     start = jnp.ones((len(towards), 3), shape.dtype)
     radiance, _ = jax.lax.scan(reweighted, start, None, length=rounds)
