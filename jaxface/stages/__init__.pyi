@@ -31,9 +31,9 @@ from .fit import (
     prepare,
     render_fit,
     skin_map,
-    with_self_shadow,
     working_photo,
 )
+from .fit.self_shadow import with_self_shadow
 from .landmarks import (
     DetectedFace,
     NoFaceError,

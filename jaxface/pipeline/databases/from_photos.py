@@ -21,7 +21,7 @@ from jaxface.pipeline.databases.photo_fits import BuildStep, FittedPhoto, fit_ph
 from jaxface.pipeline.fitting._detail_levels import detail_levels
 from jaxface.pipeline.texture.partial import texture
 from jaxface.stages._common_light import lit_vertices, shared_light
-from jaxface.stages.fit import with_self_shadow
+from jaxface.stages.fit.self_shadow import with_self_shadow
 from jaxface.stages.scan.transfer import TransferredTexture, whole_texture
 from jaxface.stages.texture.mirror import fill_from_mirror, mirror_uv
 

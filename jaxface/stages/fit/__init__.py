@@ -15,7 +15,6 @@ from jaxface.stages.fit.records import (
     LevelRecord,
 )
 from jaxface.stages.fit.rendering import FitRender, fit_hidden_shading, render_fit, skin_map
-from jaxface.stages.fit.self_shadow import with_self_shadow
 from jaxface.stages.fit.solve import (
     fit_energy,
     fit_level,
@@ -49,6 +48,5 @@ __all__ = [
     "render_fit",
     "skin_map",
     "through_levels",
-    "with_self_shadow",
     "working_photo",
 ]
