@@ -1,12 +1,15 @@
 """A database carried into another model's UVs, where the right answer is known."""
 
 import dataclasses
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from jaxface.cli import app
 from jaxface.geometry.uv import uv_layout
 from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase
@@ -137,3 +140,20 @@ def test_what_cannot_be_transferred_is_told(source, target, textures, tmp_path):
     with pytest.raises(ValueError, match="has others"):
         transfer_database(source, tmp_path / "out", textures.path, source=renamed)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_passes_everything_on(tmp_path, textures, monkeypatch):
+    calls = []
+
+    def transfer(*arguments, on_progress):
+        calls.append(arguments)
+        on_progress("textures", 2, 2)
+        return textures
+
+    monkeypatch.setattr(transferred, "transfer_database", transfer)
+    command = ["database", "transfer", "--model", "kit", "-o", str(tmp_path)]
+    answer = CliRunner().invoke(app, [*command, "--database", "maps", "--resolution", "64"])
+    assert answer.exit_code == 0, answer.output
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert calls == [("kit", tmp_path, Path("maps"), 64), ("kit", tmp_path, None, None)]
+    assert "2 textures" in answer.output
