@@ -184,6 +184,26 @@ def database_import_scan(
     console.print(f"wrote [bold]{out}[/bold]")
 
 
+@database_app.command("transfer")
+def database_transfer(
+    model: Annotated[str, typer.Option("--model", help="Into whose UVs: a model file or name.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the database.")],
+    database: Annotated[
+        Path | None,
+        typer.Option("--database", help="One in the bundled model's UVs; else procedural skins."),
+    ] = None,
+    resolution: Annotated[
+        int | None, typer.Option("--resolution", help="Texels along a side; else the database's.")
+    ] = None,
+) -> None:
+    """Carry textures over to another model by registration; goes on where it stopped."""
+    from jaxface.pipeline.databases.transferred import transfer_database
+
+    with errors(), steps(f"textures of {model}") as on_step:
+        made: Any = transfer_database(model, out, database, resolution, on_progress=on_step)
+    console.print(f"{len(made)} textures in [bold]{out}[/bold]; use it as `--database {out}`")
+
+
 @database_app.command("build")
 def database_build(
     photos: Annotated[Path, typer.Argument(help="Folder with one photo of each subject.")],

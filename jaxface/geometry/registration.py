@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from jaxface._types import Bool, Float, Int
 from jaxface.geometry.closest_point import TriangleTree
@@ -126,13 +126,23 @@ def non_rigid_icp(
             right = place.T @ (square @ found.point) + pull
             # A whisper of ridge keeps vertices without triangles solvable.
             ridge = sparse.identity(4 * count) * 1e-9
-            solved = splu(sparse.csc_matrix(matrix + ridge)).solve(right)
+            solved = _factored(matrix + ridge).solve(right)
             current = place @ solved
         if on_progress is not None:
             on_progress(stage + 1, len(stiffness))
     vertices = current / unit + middle
     distance = tree(current).distance / unit
     return Registration(vertices, distance, weight > 0)
+
+
+def _factored(matrix: sparse.spmatrix) -> SuperLU:
+    """A symmetric positive definite matrix, ordered for its own graph: no pivots are needed."""
+    return splu(
+        sparse.csc_matrix(matrix),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def _stiffness_matrix(faces: np.ndarray, count: int, skew: float) -> sparse.csr_matrix:

@@ -7,7 +7,8 @@ import jax
 
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.subdivide import subdivide
-from jaxface.stages.fit import FitModel, prepare, with_self_shadow
+from jaxface.stages.fit import FitModel, prepare
+from jaxface.stages.fit.self_shadow import with_self_shadow
 
 SUBDIVIDED_BELOW = 20_000
 """models with fewer vertices are refined once for the finer pyramid levels"""

@@ -140,12 +140,19 @@ def complete_texture(
     return jnp.where(present[..., None] > 0, texture, _continued(texture, present))
 
 
+def own_parts(
+    model: MorphableModel, layout: UVLayout
+) -> tuple[Float[Array, "r r 3"], Float[Array, "r r"]]:
+    """What `complete_texture` takes from the model: its mean albedo, and where its skin is."""
+    elsewhere = layout(jnp.clip(model.albedo_mean, 0.0, 1.0), model.faces)
+    return elsewhere, layout(skin_fields(model).regions.skin[:, None], model.faces)[..., 0]
+
+
 def whole_texture(
     found: TransferredTexture, model: MorphableModel, layout: UVLayout
 ) -> Float[Array, "r r 3"]:
     """A transferred texture (linear RGB) with eyes and mouth of the model, and no gaps."""
-    skin = layout(skin_fields(model).regions.skin[:, None], model.faces)[..., 0]
-    elsewhere = layout(jnp.clip(model.albedo_mean, 0.0, 1.0), model.faces)
+    elsewhere, skin = own_parts(model, layout)
     return complete_texture(found, elsewhere, layout, skin)
 
 
