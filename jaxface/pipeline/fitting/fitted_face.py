@@ -25,6 +25,7 @@ from jaxface.stages.fit import (
     FitStats,
     Posterior,
     WorkingPhoto,
+    brow_map,
     fit_energy,
     no_history,
     observe_finest,
@@ -34,7 +35,6 @@ from jaxface.stages.fit import (
     weights_as_data,
 )
 from jaxface.stages.fit.options import FitOptions
-from jaxface.stages.fit.rendering import brow_map
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from .records import (
     LevelRecord,
     no_history,
 )
-from .rendering import FitRender, fit_hidden_shading, render_fit, skin_map
+from .rendering import FitRender, brow_map, fit_hidden_shading, render_fit, skin_map
 from .solve import fit_level, fit_shadows, observe, observe_finest
 from .start import fit_start
 
@@ -32,6 +32,7 @@ __all__ = [
     "LevelRecord",
     "Posterior",
     "WorkingPhoto",
+    "brow_map",
     "cast_shadows",
     "fit_batch",
     "fit_energy",
