@@ -93,7 +93,7 @@ def synthesise(
     octaves: Annotated[
         int, typer.Option("--octaves", help="Sizes at which the network sees the picture.")
     ] = 4,
-    steps_: Annotated[int, typer.Option("--steps", help="Of the solver on each level.")] = 100,
+    steps_: Annotated[int, typer.Option("--steps", help="Of the solver on each level.")] = 200,
     seed: Annotated[int, typer.Option("--seed", help="Of the noise at the start.")] = 0,
 ) -> None:
     """A new picture of a texture, of any size, from a picture of it."""

@@ -71,7 +71,7 @@ def synthesise_texture(
     correlation: float = 0.0,
     histogram: float = 0.1,
     octaves: int = 4,
-    steps: int = 100,
+    steps: int = 200,
     seed: int = 0,
     method: Method = "lbfgs",
     on_step: Callable[[int, int], bool | None] | None = None,
