@@ -46,7 +46,7 @@ def made(network):
 def test_statistics_come_close_to_the_exemplars(made, network):
     exemplar = jnp.asarray(stripes())
     targets = exemplar_targets(network, exemplar, LAYERS, 2, ExemplarWeights(histogram=0.1))
-    energy = exemplar_energy(correlation=False)
+    energy = exemplar_energy()
 
     def distance(image):
         return float(energy.value(jnp.asarray(image), targets)[0])
@@ -182,7 +182,7 @@ def test_the_command_writes_a_picture(tmp_path, network):
 def test_the_command_has_the_functions_defaults():
     of_function = inspect.signature(synthesise_texture).parameters
     of_command = inspect.signature(textures.synthesise).parameters
-    for name in ("alpha", "correlation", "histogram", "octaves", "seed", "layers", "size"):
+    for name in ("alpha", "histogram", "octaves", "seed", "layers", "size"):
         assert of_command[name].default == of_function[name].default, name
     assert of_command["steps_"].default == of_function["steps"].default
     assert jaxface.synthesise_texture is synthesise_texture
