@@ -4,13 +4,14 @@ Every term is relative to the exemplar's own statistics, so that a weight means 
 network and every picture:
 
 E(I) = alpha / N sum_o sum_l ||G^l(I_o) - G^l_hat_o||_F^2 / ||G^l_hat_o||_F^2
-     + h / k sum_c ||q_c(I) - q_c_hat||^2 / sigma_c^2
+     + h / (k p) sum_c ||q_c(I) - q_c_hat||^2 / sigma_c^2
 
 - I_o is the picture halved o times, G^l the Gramian of layer l (Gatys et al. 2015; the second sum
   of eq. 3 of Saito 2017), N the number of the pairs (o, l). Gramians of an octave see twice as far
   as those of the octave before, so that a network of few layers knows large shapes too (Snelgrove
   2017, "High-Resolution Multi-Scale Neural Texture Synthesis").
-- q_c are the quantiles along axis c of the exemplar's colours, sigma_c its standard deviation
+- q_c are the p quantiles (as many as pixels) along axis c of the k axes of the exemplar's
+  colours, sigma_c its standard deviation
   (the histogram loss of Risser et al. 2017, "Stable and Controllable Neural Texture Synthesis and
   Style Transfer Using Histogram Losses").
 
