@@ -46,7 +46,7 @@ def made(network):
 def test_statistics_come_close_to_the_exemplars(made, network):
     exemplar = jnp.asarray(stripes())
     targets = exemplar_targets(network, exemplar, LAYERS, 2, ExemplarWeights(histogram=0.1))
-    energy = exemplar_energy(correlation=False)
+    energy = exemplar_energy()
 
     def distance(image):
         return float(energy.value(jnp.asarray(image), targets)[0])
@@ -97,8 +97,8 @@ def test_the_answer_is_that_of_a_louder_network(network, x64):
     assert one.texture.dtype == np.float64
 
 
-def test_coarse_to_fine_and_grey(network):
-    """A grey exemplar stays grey; each level starts from the one before."""
+def test_coarse_to_fine(network):
+    """Each level starts from the one before."""
     grey = stripes(64, 70)[..., :1]
     steps = []
     found = synthesise_texture(
@@ -107,7 +107,7 @@ def test_coarse_to_fine_and_grey(network):
     )  # fmt: skip
     assert found.texture.shape == (64, 70, 1)
     assert found.sizes == ((32, 35), (64, 70))
-    assert found.values[1][0] < 0.5 * found.values[0][0]
+    assert found.values[1][0] < 0.7 * found.values[0][0]
     assert steps[-1][1] == 24 and [done for done, _ in steps] == sorted(done for done, _ in steps)
 
 
@@ -122,6 +122,12 @@ def test_the_histogram_is_matched_where_it_is_asked_for(network):
         return np.abs(np.sort(np.asarray(image).sum(-1).ravel()) - wanted).mean()
 
     assert apart(1.0) < 0.6 * apart(0.0)
+
+
+def test_grey_stays_grey(network):
+    grey = np.repeat(stripes()[..., :1], 3, axis=-1)
+    texture = np.asarray(synthesise_texture(grey, network, steps=3, octaves=1).texture)
+    assert np.ptp(texture, axis=-1).max() < 1e-5 < np.ptp(texture)
 
 
 def test_a_texture_may_be_smaller_than_its_exemplar(network):
@@ -167,7 +173,8 @@ def test_the_command_writes_a_picture(tmp_path, network):
     options = ["--features", str(tmp_path / "net.npz"), "--size", "32x48", "--steps", "3"]
     answer = CliRunner().invoke(app, [*arguments, *options, "--octaves", "1"])
     assert answer.exit_code == 0, answer.output
-    assert Image.open(tmp_path / "out.png").size == (48, 32)
+    with Image.open(tmp_path / "out.png") as written:
+        assert written.size == (48, 32)
     wrong = CliRunner().invoke(app, [*arguments, "--size", "huge"])
     assert wrong.exit_code == 2 and "512x768" in wrong.output
 
@@ -175,7 +182,7 @@ def test_the_command_writes_a_picture(tmp_path, network):
 def test_the_command_has_the_functions_defaults():
     of_function = inspect.signature(synthesise_texture).parameters
     of_command = inspect.signature(textures.synthesise).parameters
-    for name in ("alpha", "correlation", "histogram", "octaves", "seed", "layers", "size"):
+    for name in ("alpha", "histogram", "octaves", "seed", "layers", "size"):
         assert of_command[name].default == of_function[name].default, name
     assert of_command["steps_"].default == of_function["steps"].default
     assert jaxface.synthesise_texture is synthesise_texture

@@ -68,16 +68,13 @@ def synthesise(
         str | None, typer.Option("--layers", help="As conv1_1,conv2_1; the first of each block.")
     ] = None,
     alpha: Annotated[float, typer.Option("--alpha", help="Weight of the Gram matrices.")] = 1.0,
-    correlation: Annotated[
-        float, typer.Option("--correlation", help="Weight of what repeats at a distance.")
-    ] = 0.0,
     histogram: Annotated[
         float, typer.Option("--histogram", help="Weight of the distribution of colours.")
     ] = 0.1,
     octaves: Annotated[
         int, typer.Option("--octaves", help="Sizes at which the network sees the picture.")
     ] = 4,
-    steps_: Annotated[int, typer.Option("--steps", help="Of the solver on each level.")] = 100,
+    steps_: Annotated[int, typer.Option("--steps", help="Of the solver on each level.")] = 200,
     seed: Annotated[int, typer.Option("--seed", help="Of the noise at the start.")] = 0,
 ) -> None:
     """A new picture of a texture, of any size, from a picture of it."""
@@ -86,8 +83,8 @@ def synthesise(
     with errors(), steps(str(picture)) as on_step:
         made = synthesise_file(
             picture, out, features=features, size=parse_size(size), alpha=alpha,
-            layers=None if layers is None else tuple(layers.split(",")), correlation=correlation,
-            histogram=histogram, octaves=octaves, steps=steps_, seed=seed,
+            layers=None if layers is None else tuple(layers.split(",")), histogram=histogram,
+            octaves=octaves, steps=steps_, seed=seed,
             on_step=lambda done, of: on_step("steps", done, of),
         )  # fmt: skip
     first, last = made.values[-1][0], made.values[-1][-1]

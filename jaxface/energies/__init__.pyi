@@ -20,7 +20,6 @@ from ._photometric_quadratic import (
 from .exemplar import (
     ExemplarTargets,
     ExemplarWeights,
-    exemplar_correlation_residual,
     exemplar_energy,
     exemplar_gram_residual,
     exemplar_histogram_residual,
@@ -63,7 +62,6 @@ __all__ = [
     "StyleTargets",
     "Term",
     "compose",
-    "exemplar_correlation_residual",
     "exemplar_energy",
     "exemplar_gram_residual",
     "exemplar_histogram_residual",

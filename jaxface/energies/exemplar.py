@@ -4,16 +4,14 @@ Every term is relative to the exemplar's own statistics, so that a weight means 
 network and every picture:
 
 E(I) = alpha / N sum_o sum_l ||G^l(I_o) - G^l_hat_o||_F^2 / ||G^l_hat_o||_F^2
-     + a ||R(I) - R_hat||^2 / ||R_hat||^2 + h / k sum_c ||q_c(I) - q_c_hat||^2 / sigma_c^2
+     + h / (k p) sum_c ||q_c(I) - q_c_hat||^2 / sigma_c^2
 
 - I_o is the picture halved o times, G^l the Gramian of layer l (Gatys et al. 2015; the second sum
   of eq. 3 of Saito 2017), N the number of the pairs (o, l). Gramians of an octave see twice as far
   as those of the octave before, so that a network of few layers knows large shapes too (Snelgrove
   2017, "High-Resolution Multi-Scale Neural Texture Synthesis").
-- R is the autocorrelation of the picture up to a lag: what repeats (its Fourier transform is the
-  power spectrum, the constraint of Liu et al. 2016, "Texture Synthesis Through Convolutional
-  Neural Networks and Spectrum Constraints").
-- q_c are the quantiles along axis c of the exemplar's colours, sigma_c its standard deviation
+- q_c are the p quantiles (as many as pixels) along axis c of the k axes of the exemplar's
+  colours, sigma_c its standard deviation
   (the histogram loss of Risser et al. 2017, "Stable and Controllable Neural Texture Synthesis and
   Style Transfer Using Histogram Losses").
 
@@ -33,7 +31,6 @@ from jaxface._numerics import safe_sqrt
 from jaxface._types import Array, Float
 from jaxface.energies._gram import gram
 from jaxface.energies.term import Energy, Term, compose
-from jaxface.imaging.autocorrelation import autocorrelation
 from jaxface.imaging.colour_axes import ColourAxes, colour_axes, to_channels
 from jaxface.imaging.pyramid import halve
 from jaxface.networks.texture_features.network import (
@@ -46,6 +43,9 @@ from jaxface.networks.texture_features.network import (
 SMALLEST_MAP = 8
 """px; side below which a layer's map has too few responses for a Gramian of an octave"""
 
+HISTOGRAM_WEIGHT = 0.1
+"""h, beside an alpha of 1"""
+
 Grams = tuple[Mapping[str, Float[Array, "m m"]], ...]
 """by octave, finest first, then by layer"""
 
@@ -55,8 +55,7 @@ class ExemplarWeights(eqx.Module):
 
     alpha: float | Array = 1.0
     """of the Gramians"""
-    correlation: float | Array = 0.0
-    histogram: float | Array = 0.0
+    histogram: float | Array = HISTOGRAM_WEIGHT
 
 
 class ExemplarTargets(eqx.Module):
@@ -65,8 +64,6 @@ class ExemplarTargets(eqx.Module):
     network: FeatureNetwork
     colours: ColourAxes
     grams: Grams
-    correlation: Float[Array, "k a b"]
-    """of the channels less their means, by lag"""
     quantiles: Float[Array, "q k"]
     """the exemplar's channels, each sorted"""
     weights: ExemplarWeights
@@ -91,7 +88,7 @@ def exemplar_targets(
         weights: of the terms.
         colours: axes of the colours; the exemplar's own where none are given.
         size: (h, w) of the pictures that will be compared, as the exemplar's if not given; layers,
-            octaves and lags are those that both have room for.
+            and octaves are those that both have room for.
 
     Raises:
         ValueError: the network lacks a layer, or no layer fits the sizes.
@@ -107,27 +104,20 @@ def exemplar_targets(
             f"{size[1]}; for the layers {tuple(layers)} at least "
             f"{least_side(layers)} px are needed along each side"
         )
-    # Beyond half of a picture few pairs of pixels are left to tell a lag by.
-    reach = tuple(min(a, b) // 2 for a, b in zip(exemplar.shape[:2], size, strict=True))
-    grams, correlation, quantiles = _statistics(
-        network, exemplar, colours, plan, (reach[0], reach[1])
-    )
-    return ExemplarTargets(network, colours, grams, correlation, quantiles, weights)
+    grams, quantiles = _statistics(network, exemplar, colours, plan)
+    return ExemplarTargets(network, colours, grams, quantiles, weights)
 
 
-@partial(jax.jit, static_argnums=(3, 4))
+@partial(jax.jit, static_argnums=3)
 def _statistics(
     network: FeatureNetwork,
     exemplar: Float[Array, "h w c"],
     colours: ColourAxes,
     plan: tuple[tuple[str, ...], ...],
-    reach: tuple[int, int],
-) -> tuple[Grams, Float[Array, "k a b"], Float[Array, "q k"]]:
+) -> tuple[Grams, Float[Array, "q k"]]:
     channels = to_channels(exemplar, colours)
     flat = channels.reshape(-1, channels.shape[-1])
-    around = channels - jnp.mean(flat, axis=0)
-    grams = octave_grams(network, channels, plan)
-    return grams, autocorrelation(around, reach), jnp.sort(flat, axis=0)
+    return octave_grams(network, channels, plan), jnp.sort(flat, axis=0)
 
 
 def layers_by_octave(
@@ -187,17 +177,6 @@ def exemplar_gram_residual(
     )
 
 
-def exemplar_correlation_residual(
-    image: Float[Array, "h w c"], args: ExemplarTargets
-) -> Float[Array, "k a b"]:
-    """``(R - R_hat) / ||R_hat||`` over the lags of the target."""
-    channels = to_channels(image, args.colours)
-    _, rows, columns = args.correlation.shape
-    around = channels - jnp.mean(args.quantiles, axis=0)
-    found = autocorrelation(around, (rows - 1, columns // 2))
-    return (found - args.correlation) / _safe(safe_sqrt(jnp.sum(args.correlation**2)))
-
-
 def exemplar_histogram_residual(
     image: Float[Array, "h w c"], args: ExemplarTargets
 ) -> Float[Array, "p k"]:
@@ -216,20 +195,13 @@ def exemplar_histogram_residual(
     return (values - wanted) / (spread * jnp.sqrt(jnp.asarray(pixels * axes, values.dtype)))
 
 
-def exemplar_energy(correlation: bool = True, histogram: bool = True) -> Energy:
+def exemplar_energy(histogram: bool = True) -> Energy:
     """The sum of the terms, of ``(image, ExemplarTargets)``; every term is a residual.
 
     Args:
-        correlation: whether there is that term; its weight is in the targets.
-        histogram: likewise.
+        histogram: whether there is that term; its weight is in the targets.
     """
     terms = [Term("gram", exemplar_gram_residual, lambda args: args.weights.alpha)]
-    if correlation:
-        terms.append(
-            Term(
-                "correlation", exemplar_correlation_residual, lambda args: args.weights.correlation
-            )
-        )
     if histogram:
         terms.append(
             Term("histogram", exemplar_histogram_residual, lambda args: args.weights.histogram)

@@ -18,7 +18,6 @@ class ExemplarOptions(TypedDict, total=False):
     layers: Sequence[str] | None
     alpha: float
     size: int | tuple[int, int] | None
-    correlation: float
     histogram: float
     octaves: int
     steps: int
