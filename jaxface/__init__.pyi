@@ -6,8 +6,11 @@ from .pipeline.databases.from_photos import build_database
 from .pipeline.fitting._fit import fit
 from .pipeline.fitting.outputs import save_fit
 from .pipeline.fitting.partial import texture
+from .pipeline.folder import digitize_folder
+from .pipeline.options import DigitizeOptions
 from .pipeline.texture._complete import complete
 from .pipeline.texture.folder import complete_folder
+from .pipeline.texture.options import CompletionOptions
 from .run.compile_cache import enable_compilation_cache
 from .stages.fit import FitOptions, FitWeights
 from .stages.landmarks import detect_faces
@@ -16,6 +19,8 @@ from .stages.texture._synthesise_texture import synthesise_texture
 __version__: str
 
 __all__ = [
+    "CompletionOptions",
+    "DigitizeOptions",
     "FitOptions",
     "FitWeights",
     "Term",
@@ -26,6 +31,7 @@ __all__ = [
     "compose",
     "detect_faces",
     "digitize",
+    "digitize_folder",
     "enable_compilation_cache",
     "energies",
     "fit",

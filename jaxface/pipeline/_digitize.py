@@ -85,7 +85,8 @@ def open_digitize(options: DigitizeOptions) -> Opened:
     if model.name != PAINTED_MODEL and options.database is None:
         warnings.warn(
             f"the albedo is left partial: the procedural skins are painted for {PAINTED_MODEL!r}, "
-            f"and no database in the UVs of {model.name!r} is named",
+            f"and no database in the UVs of {model.name!r} is named; `jaxface database transfer "
+            "--model MODEL -o DIR` carries them over, for --database DIR",
             stacklevel=3,
         )
         return Opened(options, model, None)
