@@ -18,12 +18,12 @@ from jaxface.models.landmark_schemes import landmarks68
 from jaxface.models.morphable import MorphableModel
 from jaxface.models.parameters import PARAMETER_NAMES, FaceParameters, neutral_parameters
 from jaxface.pipeline.fitting._detail_levels import prepared_levels
-from jaxface.pipeline.fitting.faults import check_finite
 from jaxface.pipeline.fitting.fitted_face import FittedFace
 from jaxface.pipeline.fitting.levels import compiling_levels, fit_levels
 from jaxface.pipeline.photo import as_photo
 from jaxface.run.clock import Clock
 from jaxface.run.compile_cache import keep_compiled
+from jaxface.solvers import require_finite
 from jaxface.stages.fit import (
     WorkingPhoto,
     in_units_of,
@@ -114,13 +114,24 @@ def fit(
         working = working._replace(data=dataclasses.replace(working.data, user=user))
         y = None if start is None else _begun(start, model, working, options)
     y, stats, models = fit_levels(clock, working.data, models, weights, config, y)
+    _check_finite(y, stats)
     fitted = FittedFace(
         linear, working, points[:, :2], models, y, stats, options,
         points[:, 2] if points.shape[1] > 2 else None,
     )  # fmt: skip
-    check_finite(fitted)
     fitted.estimate_posterior(clock)
     return fitted
+
+
+def _check_finite(y: FaceParameters, stats: FitStats) -> None:
+    """Refuse a fit one of whose terms was not finite, at any step of any level.
+
+    The solver takes no step that it cannot compare, so that such a fit is a start given back.
+    """
+    for level in stats.not_finite:
+        require_finite(level, "the fit")
+    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(y)):
+        raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
 
 
 def _focal_px(focal_35mm: float | None, photo: np.ndarray) -> float | None:
