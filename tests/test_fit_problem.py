@@ -129,13 +129,20 @@ def test_a_term_that_is_not_finite_is_told(scene, fitted):
 
 
 def test_a_derivative_that_is_not_finite_is_told(fitted):
-    flags = {"edge": jnp.array([False, True, False]), "photo": jnp.zeros(3, bool)}
-    steep = dataclasses.replace(fitted.stats, not_finite=({}, flags))
-    with pytest.raises(ValueError, match="the gradient of 'edge'"):
+    levels = len(fitted.stats.steps)
+
+    def flagged(*quantities):
+        flags = {"photo": jnp.array(quantities), "prior": jnp.zeros(3, bool)}
+        return dataclasses.replace(fitted.stats, not_finite=(*[{}] * (levels - 1), flags))
+
+    steep = flagged(False, True, False)
+    with pytest.raises(ValueError, match="the gradient of 'photo'"):
         _fit._check_finite(fitted.parameters, steep)
     lost = dataclasses.replace(fitted.parameters, light=jnp.full((9, 3), jnp.nan))
     with pytest.raises(ValueError, match="did not stay finite"):
         _fit._check_finite(lost, fitted.stats)
+    # A step to where a term is not finite was not taken: its values all are.
+    _fit._check_finite(fitted.parameters, flagged(True, False, False))
     _fit._check_finite(fitted.parameters, fitted.stats)
 
 

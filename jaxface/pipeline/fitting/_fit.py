@@ -128,8 +128,13 @@ def _check_finite(y: FaceParameters, stats: FitStats) -> None:
 
     The solver takes no step that it cannot compare, so that such a fit is a start given back.
     """
-    for level in stats.not_finite:
-        require_finite(level, "the fit")
+    for flags, history, used in zip(stats.not_finite, stats.energies, stats.steps, strict=True):
+        told = {}
+        for name, flag in flags.items():
+            values = np.asarray(history[name])[: int(used) + 1]
+            # A step to where a term is not finite is one that was not taken.
+            told[name] = jnp.asarray(flag) & jnp.array([not np.isfinite(values).all(), True, True])
+        require_finite(told, "the fit")
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(y)):
         raise ValueError("the fit did not stay finite; check the photo and the model for NaN")
 
