@@ -105,7 +105,7 @@ def by_optax(
         updates, state = solver.update(
             gradient, state, y, value=value, grad=gradient, value_fn=watched, data=data
         )
-        return optax.apply_updates(y, updates), state
+        return y + updates, state
 
     y, state = start, solver.init(start)
     for _ in range(limit):

@@ -105,20 +105,27 @@ class GaussNewton(optx.AbstractMinimiser):
         data = problem.refresh(y, args)
         (value, gradient, curvature, *more), parts = problem.quadratic(y, data)
         flat, unravel = ravel_pytree(y)
+        # Data may be wider than the unknowns: the model counts in the precision of the energy.
+        wide = state.damping.dtype
+        value, gradient, curvature, parts = jax.tree.map(
+            lambda x: jnp.asarray(x, wide), (value, gradient, curvature, parts)
+        )
         scale = _unit_scale(curvature)
         unit = curvature * scale[:, None] * scale
         whole = [holds_no_number(x) for x in (value, gradient, curvature)]
         broken = jnp.any(jnp.stack(whole)) | holds_no_number(flat)
 
         def attempt(carry: _Attempt) -> _Attempt:
-            matrix = unit + carry.damping * jnp.eye(len(flat), dtype=flat.dtype)
+            matrix = unit + carry.damping * jnp.eye(len(flat), dtype=wide)
             operator = lx.MatrixLinearOperator(matrix, lx.positive_semidefinite_tag)
             rhs = -0.5 * scale * gradient
             found = lx.linear_solve(operator, rhs, solver=lx.Cholesky(), throw=False).value
-            trial = flat + scale * found
+            trial = (flat + scale * found).astype(flat.dtype)
             usable = jnp.all(jnp.isfinite(trial))
             trial = jnp.where(usable, trial, flat)
-            trial_value, trial_parts = problem.energy(unravel(trial), data)
+            trial_value, trial_parts = jax.tree.map(
+                lambda x: jnp.asarray(x, wide), problem.energy(unravel(trial), data)
+            )
             better = usable & (trial_value < value) & jnp.isfinite(trial_value)
             next_damping = jnp.where(
                 better, carry.damping / 3, jnp.maximum(carry.damping * 8, 1e-6)
