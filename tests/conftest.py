@@ -23,10 +23,11 @@ def check_signatures() -> None:
     import numpy as np
 
     import jaxface._types
+    import tests.signatures  # noqa: F401 the hook looks it up by name
 
-    jaxface._types.Array = jax.Array | np.ndarray  # type: ignore[misc, assignment]
-    jaxtyping.install_import_hook("jaxface", "beartype.beartype")
-    raises = pytest.raises
+    jaxface._types.Array = jax.Array | np.ndarray
+    jaxtyping.install_import_hook("jaxface", "tests.signatures.checked")
+    raises: Any = pytest.raises
 
     @contextlib.contextmanager
     def unchecked(*args: Any, **options: Any) -> Iterator[Any]:
@@ -37,7 +38,7 @@ def check_signatures() -> None:
         finally:
             jaxtyping.config.update("jaxtyping_disable", False)
 
-    pytest.raises = unchecked  # type: ignore[assignment]
+    pytest.raises = unchecked
 
 
 if os.environ.get("JAXFACE_TYPECHECK"):  # before any module of the package is imported

@@ -102,6 +102,11 @@ def is_array(annotation: Any) -> bool:
     )
 
 
+def holds_arrays(annotation: Any) -> bool:
+    """Whether it is an array of jaxtyping or NumPy."""
+    return is_array(annotation) or annotation is np.ndarray
+
+
 def is_record(annotation: Any) -> bool:
     """Whether it is a dataclass or named tuple of ours."""
     ours = getattr(annotation, "__module__", "").startswith(jaxface.__name__)
@@ -124,8 +129,8 @@ def may_be(annotation: Any, kind: str) -> bool:
 def is_host(function: Callable[..., Any]) -> bool:
     """Whether a function is NumPy's: some annotation of its signature allows its arrays alone."""
     for annotation in hints(function).values():
-        kinds = [p for p in parts(annotation) if is_array(p) or p is np.ndarray]
-        if kinds and all(getattr(p, "array_type", p) is np.ndarray for p in kinds):
+        kinds = [getattr(p, "array_type", p) for p in parts(annotation) if holds_arrays(p)]
+        if kinds and all(kind is np.ndarray for kind in kinds):
             return True
     return False
 

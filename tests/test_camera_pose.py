@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxface.geometry.camera import Camera, Pose
+from jaxface.geometry.nearest_rotation import nearest_rotation
 from jaxface.geometry.pose import pose_from_landmarks
 from jaxface.geometry.ray import pixel_rays, ray_weights
 from jaxface.geometry.rotation import (
@@ -71,6 +72,33 @@ def test_euler_angles_rebuild_the_rotation(x64):
     rotation = scipy.spatial.transform.Rotation.from_euler("YXZ", [0.4, -0.3, 0.2])
     angles = euler_yxz(jnp.asarray(rotation.as_matrix()))
     np.testing.assert_allclose(angles, [0.4, -0.3, 0.2], atol=1e-10)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_euler_angles_at_the_pole(sign, x64):
+    # Exactly at the pole, and a thousandth of a degree from it, where a sine has lost its digits.
+    pole = jnp.array([[0.0, sign, 0.0], [0.0, 0.0, -sign], [-1.0, 0.0, 0.0]])
+    angles = euler_yxz(pole)
+    np.testing.assert_allclose(angles, [0.0, sign * np.pi / 2, 0.0], atol=1e-15)
+    forward, reverse = jax.jacfwd(euler_yxz)(pole), jax.jacrev(euler_yxz)(pole)
+    assert np.isfinite(forward).all()
+    np.testing.assert_allclose(forward, reverse, atol=1e-12)
+    near = [0.4, sign * (np.pi / 2 - 2e-5), 0.2]
+    matrix = scipy.spatial.transform.Rotation.from_euler("YXZ", near).as_matrix()
+    np.testing.assert_allclose(euler_yxz(jnp.asarray(matrix)), near, atol=1e-9)
+    single = euler_yxz(jnp.asarray(matrix, jnp.float32))
+    np.testing.assert_allclose(single[1], near[1], atol=1e-7)
+
+
+def test_nearest_rotation_has_derivatives_where_singular_values_are_equal(x64):
+    matrix = 2.0 * rotation_matrix(jnp.array([0.3, -0.2, 0.5]))
+    change = jnp.asarray(np.random.default_rng(1).normal(size=(3, 3)))
+    found, moved = jax.jvp(nearest_rotation, (matrix,), (change,))
+    np.testing.assert_allclose(found, matrix / 2, atol=1e-12)
+    ahead, behind = (nearest_rotation(matrix + s * change) for s in (1e-6, -1e-6))
+    np.testing.assert_allclose(moved, (ahead - behind) / 2e-6, atol=1e-8)
+    mirrored = nearest_rotation(jnp.diag(jnp.array([3.0, 2.0, -1.0])))
+    np.testing.assert_allclose(mirrored, np.eye(3), atol=1e-12)
 
 
 def test_projection_by_hand():

@@ -1,12 +1,15 @@
 """E_lan, sliding contours, priors: values against the formula, gradients, singular points."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
-from jaxface.energies.landmark import LandmarkData, landmark_residual
+from jaxface.energies.landmark import LandmarkData, landmark_difference, landmark_residual
 from jaxface.energies.prior import focal_residual, light_residual, prior_residual
 from jaxface.geometry.rotation import rotation_matrix
 from jaxface.models.morphable import SurfacePoints
@@ -65,6 +68,56 @@ def test_gradients(landmark_scene, term):
     direction = jnp.asarray(np.random.default_rng(0).normal(size=flat.shape))
     central = (energy(flat + 1e-5 * direction) - energy(flat - 1e-5 * direction)) / 2e-5
     assert float(reverse @ direction) == pytest.approx(float(central), rel=1e-6, abs=1e-9)
+
+
+def test_a_landmark_of_weight_zero_takes_no_part_and_has_derivatives(landmark_scene):
+    _, y, data = landmark_scene
+
+    def row_of(weight):
+        return landmark_residual(y, eqx.tree_at(lambda d: d.weight, data, weight))
+
+    weight = data.weight.at[3].set(0.0)
+    rows = row_of(weight)
+    others = jnp.delete(weight, 3)
+    np.testing.assert_array_equal(rows[3], 0.0)
+    assert float(jnp.sum(others) / jnp.sum(weight)) == 1.0
+    forward, reverse = jax.jacfwd(row_of)(weight), jax.jacrev(row_of)(weight)
+    assert np.isfinite(forward).all()
+    np.testing.assert_allclose(forward, reverse, atol=1e-12)
+
+
+@settings(max_examples=10)
+@given(scale=st.floats(1e-3, 1e3), seed=st.integers(0, 99))
+def test_weights_count_by_their_shares(scale, seed):
+    rng = np.random.default_rng(seed)
+    model = small_model(5)
+    points = SurfacePoints(model.landmarks68.vertices, model.landmarks68.weights)
+    y, weight = small_parameters(model), jnp.asarray(rng.uniform(0, 1, 12) * (rng.random(12) < 0.8))
+    target = jnp.asarray(rng.uniform(0.2, 0.8, (12, 2)))
+    data = LandmarkData(model, points, target, weight, jnp.full(2, 0.5), jnp.asarray(0.3))
+    scaled = eqx.tree_at(lambda d: d.weight, data, scale * weight)
+    one, other = landmark_residual(y, data), landmark_residual(y, scaled)
+    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * float(jnp.abs(one).max()))
+    distance = jnp.sum(landmark_difference(y, data) ** 2, axis=1) / 0.3**2
+    assert float(jnp.sum(one**2)) <= 1.001 * float(distance.max()) + 1e-6
+
+
+@settings(max_examples=10)
+@given(factor=st.floats(0.01, 100.0), seed=st.integers(0, 99))
+def test_light_prior_does_not_know_the_exposure_and_priors_are_even(factor, seed):
+    rng = np.random.default_rng(seed)
+    y = small_parameters(small_model(5), seed)
+    light = jnp.asarray(rng.normal(size=(9, 3))).at[0].set(rng.uniform(0.5, 2.0, 3))
+    y = eqx.tree_at(lambda p: p.light, y, light)
+    brighter = eqx.tree_at(lambda p: p.light, y, factor * light)
+    if factor * float(jnp.mean(light[0])) > 2e-3:
+        np.testing.assert_allclose(light_residual(brighter), light_residual(y), rtol=1e-4)
+    turned = jax.tree.map(lambda x: -x, y)
+    for one, other in zip(*(jax.tree.leaves(prior_residual(p)) for p in (y, turned)), strict=True):
+        np.testing.assert_array_equal(one, -other)
+    centre = y.log_focal + factor
+    above, below = (focal_residual(y, (c, 0.3)) for c in (centre, 2 * y.log_focal - centre))
+    assert float(above) == pytest.approx(-float(below), rel=1e-3)
 
 
 def test_prior_counts_every_coefficient_once(landmark_scene):

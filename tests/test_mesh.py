@@ -26,6 +26,24 @@ def grid(n, seed=0):
     return vertices, faces
 
 
+@pytest.mark.parametrize("double", [False, True])
+def test_opposite_faces_cancel_whatever_their_first_corner(double):
+    with jax.enable_x64(double):
+        vertices = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)) + 3.0)
+        faces = jnp.array([[0, 1, 2], [1, 0, 2], [0, 3, 4], [4, 3, 0]])
+        direction = jnp.ones_like(vertices)
+
+        def normals(moved):
+            return mesh.vertex_normals(moved, faces)
+
+        value, forward = jax.jvp(normals, (vertices,), (direction,))
+        reverse = jax.vjp(normals, vertices)[1](jnp.ones_like(value))[0]
+        for found in (value, forward, reverse):
+            np.testing.assert_array_equal(found, 0.0)
+        kept = mesh.vertex_normals(vertices, faces[:1])
+        np.testing.assert_allclose(jnp.linalg.norm(kept[:3], axis=1), 1.0, rtol=1e-5)
+
+
 def test_normals_point_outward_and_are_area_weighted():
     normals = mesh.face_normals(jnp.asarray(TETRAHEDRON), TETRAHEDRON_FACES)
     outward = np.array([[0, 0, -1], [0, -1, 0], [-1, 0, 0], np.ones(3) / np.sqrt(3)])

@@ -165,6 +165,20 @@ def test_known_detail_is_its_definition_and_differentiable_at_rest(x64):
         np.testing.assert_allclose(gradient, 0.0, atol=1e-14)
 
 
+@settings(deadline=None, max_examples=10)
+@given(scale=st.floats(0.1, 10.0), blur=st.floats(0.0, 3.0), seed=st.integers(0, 99))
+def test_known_detail_grows_with_the_square_of_the_distance(scale, blur, seed):
+    rng = np.random.default_rng(seed)
+    photo, weight, low, detail, away = (
+        jnp.asarray(rng.uniform(size=(9, 11)), jnp.float32) for _ in range(5)
+    )
+    known = KnownDetail(photo, weight, low, detail, jnp.asarray(blur, jnp.float32))
+    for energy, rest in ((photo_detail_energy, photo), (plain_detail_energy, low)):
+        one, scaled = (float(energy(rest + s * away, known)) for s in (1.0, scale))
+        assert one >= 0 and float(energy(rest, known)) == 0
+        assert scaled == pytest.approx(scale**2 * one, rel=1e-3)
+
+
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.3, 3.0), st.integers(0, 1000))
 def test_low_pass_keeps_the_sum_and_shrinks_the_spread(blur, seed):

@@ -56,7 +56,7 @@ def grams(
     layers: Sequence[str] = STYLE_LAYERS,
     tile: int | None = None,
     method: str = "auto",
-) -> dict[str, Float[Array, "n n"]]:
+) -> dict[str, Float[Array, "_ _"]]:
     """Gramians G^l(I) of an image.
 
     Differentiable in both modes with and without tiles.
@@ -79,10 +79,10 @@ def grams(
 class StyleTargets(eqx.Module):
     """What a texture is to match: the hatted quantities of eq. 3, with weights."""
 
-    grams: Mapping[str, Float[Array, "n n"]]
-    """by layer of L_G"""
-    features: Mapping[str, Float[Array, "hl wl n"]] = eqx.field(default_factory=dict)
-    """by layer of L_F"""
+    grams: Mapping[str, Float[Array, "_ _"]]
+    """by layer of L_G, (n, n) with the n of each"""
+    features: Mapping[str, Float[Array, "_ _ _"]] = eqx.field(default_factory=dict)
+    """by layer of L_F, (h, w, n) with those of each"""
     alpha: Float[Array, ""] | float = DETAIL_WEIGHT
     gram_weights: Mapping[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
     """by layer; 1 where none is given, as in the paper"""
@@ -97,8 +97,8 @@ class StyleData(eqx.Module):
 
 
 def gram_loss(
-    grams: Mapping[str, Float[Array, "n n"]],
-    targets: Mapping[str, Float[Array, "n n"]],
+    grams: Mapping[str, Float[Array, "_ _"]],
+    targets: Mapping[str, Float[Array, "_ _"]],
     weights: Mapping[str, Float[Array, ""] | float] | None = None,
 ) -> Float[Array, ""]:
     """``sum_l w_l ||G^l - G^l_hat||_F^2`` over the layers of ``targets``; weights default to 1.
@@ -110,8 +110,8 @@ def gram_loss(
 
 
 def feature_loss(
-    features: Mapping[str, Float[Array, "hl wl n"]],
-    targets: Mapping[str, Float[Array, "hl wl n"]],
+    features: Mapping[str, Float[Array, "_ _ _"]],
+    targets: Mapping[str, Float[Array, "_ _ _"]],
     weights: Mapping[str, Float[Array, ""] | float] | None = None,
 ) -> Float[Array, ""]:
     """``sum_l w_l ||F^l - F^l_hat||_F^2`` over the layers of ``targets``; weights default to 1.
@@ -178,10 +178,10 @@ def _statistics(
     image: Float[Array, "h w"],
     network: FeatureNetwork,
     gram_layers: tuple[str, ...],
-    feature_targets: Mapping[str, Float[Array, "hl wl n"]],
+    feature_targets: Mapping[str, Float[Array, "_ _ _"]],
     tile: int | None,
     method: str,
-) -> tuple[dict[str, Float[Array, "n n"]], dict[str, Float[Array, ""]]]:
+) -> tuple[dict[str, Float[Array, "_ _"]], dict[str, Float[Array, ""]]]:
     """Gramians, and squared distances of the responses from their targets, by layer."""
     layers = tuple(dict.fromkeys((*gram_layers, *feature_targets)))
     if tile is None or max(image.shape) <= tile:

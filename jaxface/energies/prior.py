@@ -6,7 +6,7 @@ from jaxface._types import Array, Float, PyTree
 from jaxface.models.parameters import FaceParameters
 
 
-def prior_residual(y: FaceParameters, args: PyTree = None) -> dict[str, Float[Array, "k"]]:
+def prior_residual(y: FaceParameters, args: PyTree = None) -> dict[str, Float[Array, "_"]]:
     """Residuals with ``||r||^2 = E_reg = sum (alpha_i / sigma_i)^2`` over all coefficients.
 
     Coefficients are counted in standard deviations, so they are their own residuals.

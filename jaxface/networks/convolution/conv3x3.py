@@ -98,8 +98,8 @@ def _check(x: Array, kernel: Array, method: str) -> None:
 
 
 def direct_conv3x3(
-    x: Float[Array, "h w i"], kernel: Float[Array, "3 3 i o"], transpose: bool = False
-) -> Float[Array, "h w o"]:
+    x: Float[Array, "h w _"], kernel: Float[Array, "3 3 i o"], transpose: bool = False
+) -> Float[Array, "h w _"]:
     """The same by ``lax.conv_general_dilated``, or its adjoint (from o channels to i)."""
     if transpose:
         kernel = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)

@@ -82,14 +82,14 @@ floats a channel, before the matrix products and after them"""
 
 
 def winograd_conv3x3(
-    x: Float[Array, "h w i"],
+    x: Float[Array, "h w _"],
     kernel: Float[Array, "3 3 i o"],
-    bias: Float[Array, "o"] | None = None,
-    gate: Bool[Array, "h w i"] | None = None,
+    bias: Float[Array, "_"] | None = None,
+    gate: Bool[Array, "h w _"] | None = None,
     transpose: bool = False,
     tiles_at_once: int = _TILES_AT_ONCE,
     transformed: Sequence[Float[Array, "p i o"]] = (),
-) -> Float[Array, "h w o"]:
+) -> Float[Array, "h w _"]:
     """Correlation with a 3x3 kernel, zeros outside the image.
 
     In float32 the result differs from the exact one by about 1e-5 of its largest value, some ten

@@ -22,15 +22,15 @@ POOLINGS = ("average", "max")
 
 
 class FeatureNetwork(eqx.Module):
-    """Kernels and biases by layer name, ``convB_I`` for the I-th convolution of block B.
+    """Kernels (HWIO) and biases by layer name, ``convB_I`` for the I-th convolution of block B.
 
     The first kernel has two input channels: the image, and an indicator that is 1 inside the
     image and 0 outside. The second carries what a network subtracts from its input, so that the
     zeros around the image are zeros *after* the subtraction, as in training, exactly.
     """
 
-    kernels: dict[str, Float[Array, "3 3 i o"]]
-    biases: dict[str, Float[Array, "o"]]
+    kernels: dict[str, Float[Array, "3 3 _ _"]]
+    biases: dict[str, Float[Array, "_"]]
     pooling: str = eqx.field(static=True, default="average")
     """``average`` (Gatys et al. 2015: smoother gradients) or ``max``"""
     name: str = eqx.field(static=True, default="network")
@@ -118,7 +118,7 @@ def features(
     image: Float[Array, "h w"],
     layers: Sequence[str] = STYLE_LAYERS,
     method: str = "auto",
-) -> dict[str, Float[Array, "hl wl n"]]:
+) -> dict[str, Float[Array, "_ _ _"]]:
     """Responses F^l(I) after the ReLU of the layers asked for.
 
     Differentiable in both modes, to any order, and mappable.

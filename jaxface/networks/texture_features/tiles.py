@@ -142,7 +142,7 @@ def _responses(
     shape: tuple[int, int],
     layers: Sequence[str],
     method: str,
-) -> dict[str, Float[Array, "t t n"]]:
+) -> dict[str, Float[Array, "_ _ _"]]:
     """Responses of a tile, from its window."""
     wanted: dict[str, Any] = {}
     x: Any = window
