@@ -16,8 +16,9 @@ from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.skin.regions import skin_fields
 from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.pipeline.databases.grams import precompute
+from jaxface.pipeline.databases.usual import open_database
 from jaxface.pipeline.texture._complete import complete
-from jaxface.pipeline.texture.folder import _Levels, open_database
+from jaxface.pipeline.texture.folder import _Levels
 from jaxface.pipeline.texture.options import CompletionOptions
 from jaxface.pipeline.texture.records import Level
 from jaxface.pipeline.texture.seen import SeenTexture, read_seen_texture, seen_texture

@@ -12,18 +12,16 @@ from jaxface.io.face_models import load_model
 from jaxface.io.formats.image import Photo
 from jaxface.io.formats.landmark_file import read_landmarks
 from jaxface.models.morphable import MorphableModel
+from jaxface.pipeline.databases.usual import PAINTED_MODEL, OnStep, silent
 from jaxface.pipeline.fitting._fit import FittedFace, fit
 from jaxface.pipeline.fitting.outputs import save_fit
 from jaxface.pipeline.fitting.partial import texture
 from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
 from jaxface.pipeline.photo import DEMO, open_photo, read_mask
 from jaxface.pipeline.texture.folder import (
-    PAINTED_MODEL,
     CompletionInputs,
-    OnStep,
     complete_folder,
     open_inputs,
-    silent,
 )
 from jaxface.run.clock import Clock
 

@@ -12,10 +12,11 @@ from jaxface.io.face_models.model_file import bundled_models
 from jaxface.io.feature_weights import NAMES
 from jaxface.io.file_lock import claimed
 from jaxface.pipeline import _digitize as one
+from jaxface.pipeline.databases.usual import OnStep, silent
 from jaxface.pipeline.fitting._fit import FittedFace
 from jaxface.pipeline.options import DigitizeOptions, DigitizeOverrides
 from jaxface.pipeline.photo import in_order
-from jaxface.pipeline.texture.folder import WORK_FOLDER, OnStep, silent
+from jaxface.pipeline.texture.folder import WORK_FOLDER
 
 LOCKS = ".locks"
 """folder, among the results, of the locks of the photos that are worked on"""

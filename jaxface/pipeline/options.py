@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TypedDict
 
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.texture.folder import PAINTED_MODEL
+from jaxface.pipeline.databases.usual import PAINTED_MODEL
 from jaxface.pipeline.texture.options import CompletionOptions
 from jaxface.stages.fit.options import FitOptions
 

@@ -106,7 +106,10 @@ def build_database(
         database = begun()
         if all(database.is_whole(n) for n in names):
             return database
-    face = with_self_shadow(face, options.self_shadow)
+    # Not the occlusion that the model may store: that of these very vertices, at which the photos
+    # are compared.
+    bare = with_self_shadow(face, False)
+    face = with_self_shadow(bare, options.self_shadow)
     fits, first_problem = fit_photos(photos, names, Path(out) / FITS, face, options, tell)
     if not fits:
         raise ValueError(f"no photo of {folder} could be fitted; the first: {first_problem}")

@@ -12,7 +12,7 @@ from jaxface.geometry.uv import UVLayout, uv_layout
 from jaxface.io.face_models import load_model
 from jaxface.io.texture_database import TextureDatabase, uv_digest
 from jaxface.models.morphable import MorphableModel
-from jaxface.pipeline.texture.folder import open_database
+from jaxface.pipeline.databases.usual import open_database
 from jaxface.stages.scan.head_scan import mean_head
 from jaxface.stages.scan.register import register_topology
 from jaxface.stages.scan.transfer import complete_texture, own_parts, resample_texture, surface_uv

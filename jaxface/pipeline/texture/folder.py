@@ -13,10 +13,10 @@ from jaxface.io.checkpoint import Checkpoint
 from jaxface.io.digest import digest
 from jaxface.io.feature_weights import load_network, network_digest
 from jaxface.io.formats.image import write_png
-from jaxface.io.texture_database import TextureDatabase, databases_dir
+from jaxface.io.texture_database import TextureDatabase
 from jaxface.models.morphable import MorphableModel
 from jaxface.networks.texture_features.network import FeatureNetwork
-from jaxface.pipeline.databases.painted import PAINTING, synth_database
+from jaxface.pipeline.databases.usual import OnStep, open_database, silent
 from jaxface.pipeline.texture._complete import check_subjects, complete
 from jaxface.pipeline.texture.options import CompletionOptions
 from jaxface.pipeline.texture.outputs import save_completed
@@ -31,23 +31,8 @@ from jaxface.pipeline.texture.seen import (
 from jaxface.run.kept_programs import source_digest
 from jaxface.run.memory import hand_back_freed_memory
 
-PAINTED_MODEL = "makehuman"
-"""in whose UVs the procedural skins are"""
-
-SUBJECTS = 24
-"""of the procedural database that is made where none is named"""
-
-LARGEST_DATABASE = 2048
-"""texels of its textures at most; finer maps are synthesised from these"""
-
 PREVIEW_SECONDS = 30.0
 WORK_FOLDER = ".completion"
-
-OnStep = Callable[[str, int, int], None]
-
-
-def silent(what: str, done: int, of: int) -> None:
-    """Tell nobody of a step."""
 
 
 class CompletionInputs(NamedTuple):
@@ -155,34 +140,6 @@ def complete_folder(
     work.clear()
     (place / "albedo_preview.png").unlink(missing_ok=True)
     return done
-
-
-def open_database(
-    path: str | os.PathLike[str] | TextureDatabase | None,
-    model: MorphableModel,
-    resolution: int,
-    on_step: OnStep = silent,
-) -> TextureDatabase:
-    """The database of a path; without one the procedural one, made where it is not there yet.
-
-    Raises:
-        FileNotFoundError: there is no database.
-        ValueError: it is in the UVs of another model, or there is none for this model.
-    """
-    if isinstance(path, TextureDatabase):
-        return path
-    if path is not None:
-        return TextureDatabase(path, model)
-    if model.name != PAINTED_MODEL:
-        raise ValueError(
-            f"the procedural skins are painted for {PAINTED_MODEL!r}, not for {model.name!r}; name "
-            "a database in this model's UVs"
-        )
-    size = min(resolution, LARGEST_DATABASE)
-    folder = databases_dir() / f"procedural-v{PAINTING}-{size}"
-    return synth_database(
-        folder, SUBJECTS, size, on_progress=lambda i, n: on_step("procedural skins", i, n)
-    )
 
 
 class _Levels:
