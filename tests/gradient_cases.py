@@ -30,9 +30,11 @@ from jaxface.networks.texture_features.network import FeatureNetwork, features
 from jaxface.networks.texture_features.random_weights import random_network
 from jaxface.networks.texture_features.tiles import sum_over_tiles, tile_of_map
 from jaxface.render._rasterize import rasterize
+from jaxface.stages.fit.objective import fit_energy
 from jaxface.stages.fit.prepared import FitModel
 from jaxface.stages.fit.records import FitConfig, FitData, FitInput, FitWeights
-from jaxface.stages.fit.solve import fit_energy, initial_light, observe
+from jaxface.stages.fit.solve import observe
+from jaxface.stages.fit.start import initial_light
 from jaxface.stages.fit.visible import visible_samples
 from jaxface.stages.texture._synthesise import SynthesisWeights
 from tests.gradient_walk import Maker

@@ -13,8 +13,8 @@ from jaxface.stages.scan._embed_landmarks import embed_landmarks, with_landmarks
 def test_two_views_find_most_of_the_bundled_landmarks():
     model = load_bundled("makehuman")
     bare = eqx.tree_at(lambda m: (m.landmarks68, m.landmarks468), model, (None, None))
-    found = embed_landmarks(bare, yaws=(0.0, 15.0))
-    assert found.views == len(found.pictures) == 2
+    found = embed_landmarks(bare, detect_faces, yaws=(0.0, 15.0))
+    assert found.views == len(found.looks) == 2
     assert model.landmarks468 is not None and model.landmarks68 is not None
     distance = np.linalg.norm(
         np.asarray(found.points(model.mean) - model.landmarks468(model.mean)), axis=1

@@ -14,6 +14,7 @@ from jaxface.pipeline import fit
 def test_a_term_that_is_no_number_is_named():
     """Without a word the photo would count for nothing, and the landmarks alone would decide."""
     model = load_bundled("makehuman")
+    assert model.landmarks68 is not None
     points = np.asarray(model.landmarks68(model.mean))
     points = 32 + 0.2 * (points[:, :2] - points[:, :2].mean(axis=0)) * [1, -1]
     photo = np.full((64, 64, 3), 0.5, np.float32)

@@ -25,12 +25,12 @@ from jaxface.pipeline.folder import (
     LOCKS,
     Journey,
     folders_of,
-    photos_in,
     reason,
     run_folder,
     shard_of,
 )
 from jaxface.pipeline.options import DigitizeOptions
+from jaxface.pipeline.photo import photos_in
 from jaxface.stages.fit.options import FitOptions
 from tests.photo_stamps import Stamps, photos, processes, written
 

@@ -25,6 +25,7 @@ from jaxface.run.clock import Clock
 from jaxface.run.compile_cache import keep_compiled
 from jaxface.solvers import require_finite
 from jaxface.stages.fit import (
+    FitStats,
     WorkingPhoto,
     in_units_of,
     input_shapes,
