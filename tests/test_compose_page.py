@@ -58,7 +58,7 @@ def test_a_sweep_compiles_once(page):
 def test_terms_are_reported_and_differentiated(page):
     assert set(page["parts"]) == {"markers", "prior"}
     assert float(page["total"]) == pytest.approx(float(sum(page["parts"].values())))
-    assert set(page["slope"]) == {"identity", "turn", "shift"}
+    assert set(page["slope"]) == {"identity", "scale", "shift"}
 
 
 def test_a_scalar_through_renderer_and_network_falls(page):
