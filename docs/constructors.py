@@ -1,4 +1,4 @@
-"""Constructors of records (equinox modules, named tuples), which griffe knows of dataclasses alone."""
+"""Constructors of records: equinox modules and named tuples; griffe knows those of dataclasses."""
 
 import griffe
 
