@@ -7,41 +7,51 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxface import energies, render, stages
 from jaxface._numerics import above_rounding
+from jaxface.energies.exemplar import exemplar_gram_residual
 from jaxface.energies.term import Term, compose
-from jaxface.geometry.camera import Pose
 from jaxface.geometry.nearest_rotation import rotation_change
-from jaxface.geometry.normal_stencil import NormalStencil, normal_derivative, normal_stencil
+from jaxface.geometry.normal_stencil import normal_derivative
 from jaxface.geometry.rotation import rotation_matrices, rotation_matrix
-from jaxface.geometry.uv import UVLayout
 from jaxface.imaging.masks import smoothstep
-from jaxface.imaging.mipmap import Mipmap, mipmap
+from jaxface.imaging.mipmap import Mipmap
 from jaxface.imaging.suv import remove_specular_peak
 from jaxface.models.face_oval import face_oval
-from jaxface.models.morphable import MorphableModel
-from jaxface.models.parameters import FaceParameters
 from jaxface.models.skin.patch import patch_at
 from jaxface.models.skin.pigments import Density
 from jaxface.models.skin.regions import SkinFields
-from jaxface.networks.texture_features.network import FeatureNetwork, features
-from jaxface.networks.texture_features.random_weights import random_network
+from jaxface.networks.texture_features.network import features
 from jaxface.networks.texture_features.tiles import sum_over_tiles, tile_of_map
 from jaxface.render._rasterize import rasterize
 from jaxface.stages.fit.objective import fit_energy
-from jaxface.stages.fit.prepared import FitModel
-from jaxface.stages.fit.records import FitConfig, FitData, FitInput, FitWeights
+from jaxface.stages.fit.records import FitConfig, FitInput, FitWeights
 from jaxface.stages.fit.solve import observe
 from jaxface.stages.fit.start import initial_light
 from jaxface.stages.fit.visible import visible_samples
 from jaxface.stages.texture._synthesise import SynthesisWeights
+from jaxface.stages.texture.composition import with_seen
+from jaxface.stages.texture.seen_level import SeenLevel
+from tests.gradient_inputs import (
+    SIDE,
+    exemplar,
+    fit_data,
+    fit_input,
+    fit_model,
+    fit_weights,
+    layout,
+    model,
+    network,
+    parameters,
+    pyramid,
+    samples,
+    scene,
+    screen,
+    stencil,
+    style,
+)
 from tests.gradient_walk import Maker
-from tests.small_scene import small_model, small_parameters
-
-SIDE = 12
-"""px of a rendered picture"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,182 +67,6 @@ class Case:
     arguments: dict[str, Any]
     held: Mapping[str, str] = dataclasses.field(default_factory=dict)
     singular: str = ""
-
-
-@functools.cache
-def model() -> MorphableModel:
-    """A bump of 5 x 5 vertices with four modes of each kind and self-occlusion."""
-    made = small_model(5)
-    rng = np.random.default_rng(7)
-    four = dataclasses.replace(made.albedo, basis=40 * made.albedo.basis)
-    return dataclasses.replace(
-        made,
-        identity=made.identity.truncated(4),
-        expression=four,
-        expression_names=tuple("abcd"),
-        occlusion=jnp.asarray(-0.05 * rng.random((25, 9))),
-        occlusion_slope=jnp.asarray(0.02 * rng.normal(size=(25, 3, 9))),
-    )
-
-
-@functools.cache
-def parameters() -> FaceParameters:
-    """The bump seen from the front, a little turned."""
-    return small_parameters(model())
-
-
-@functools.cache
-def stencil() -> NormalStencil:
-    """Of the bump's mesh."""
-    return normal_stencil(np.asarray(model().faces), model().vertex_count)
-
-
-@functools.cache
-def samples() -> energies.PixelSamples:
-    """Pixels of a random photo of the bump, near the middles of its triangles."""
-    rng, faces = np.random.default_rng(9), np.asarray(model().faces)
-    middle = np.asarray(screen())[faces, :2].mean(axis=1) / SIDE
-    return energies.PixelSamples(
-        jnp.asarray(middle), model().faces, jnp.asarray(rng.uniform(0.2, 0.8, (len(faces), 3))),
-        jnp.asarray(rng.uniform(0.2, 0.8, len(faces))),
-        jnp.array([0.48, 0.53]),
-    )  # fmt: skip
-
-
-@functools.cache
-def layout() -> UVLayout:
-    """Texels of random triangles, some empty."""
-    rng = np.random.default_rng(3)
-    triangle = rng.integers(-1, len(model().faces), (8, 8))
-    return UVLayout(
-        jnp.asarray(triangle),
-        jnp.asarray(rng.dirichlet(np.ones(3), (8, 8))[..., 1:]),
-        jnp.asarray(triangle >= 0),
-        jnp.asarray(rng.uniform(0.5, 2.0, len(model().faces))),
-    )
-
-
-@functools.cache
-def network() -> FeatureNetwork:
-    """Two blocks of three and four channels, in the present precision."""
-    made = random_network(((1, 3), (1, 4)), seed=3)
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), made)
-
-
-@functools.cache
-def style() -> energies.StyleData:
-    """Targets for both layers, with a weight for each."""
-    rng = np.random.default_rng(5)
-    grams = {"conv1_1": jnp.asarray(rng.random((3, 3))), "conv2_1": jnp.asarray(rng.random((4, 4)))}
-    maps = {"conv2_1": jnp.asarray(rng.random((3, 3, 4)))}
-    weights = {"conv1_1": jnp.asarray(0.5), "conv2_1": jnp.asarray(2.0)}
-    half = {"conv2_1": jnp.asarray(0.5)}
-    targets = energies.StyleTargets(grams, maps, jnp.asarray(3.0), weights, half)
-    return energies.StyleData(network(), targets)
-
-
-@functools.cache
-def landmarks() -> energies.LandmarkData:
-    """Detected near where the bump's landmarks are."""
-    rng, points = np.random.default_rng(2), model().landmarks68
-    assert points is not None
-    return energies.LandmarkData(
-        model(), points, jnp.asarray(rng.uniform(0.3, 0.7, (12, 2))),
-        jnp.asarray(rng.random(12)), jnp.array([0.5, 0.5]), jnp.asarray(0.3),
-    )  # fmt: skip
-
-
-@functools.cache
-def fit_model() -> FitModel:
-    """The bump prepared for a fit."""
-    points = model().landmarks68
-    assert points is not None
-    return FitModel(
-        model(), stencil(), points, jnp.array([0, 1]), jnp.arange(25),
-        jnp.ones(25, bool), jnp.ones(32, bool),
-    )  # fmt: skip
-
-
-@functools.cache
-def fit_weights() -> FitWeights:
-    """The defaults, as arrays."""
-    return jax.tree.map(jnp.asarray, FitWeights())
-
-
-@functools.cache
-def fit_input() -> FitInput:
-    """A random photo."""
-    rng, data = np.random.default_rng(1), landmarks()
-    return FitInput(
-        jnp.asarray(rng.uniform(0.2, 0.8, (SIDE, SIDE, 3))),
-        jnp.asarray(rng.uniform(0.2, 0.8, (SIDE, SIDE))),
-        data.target, data.weight, data.unit, data.principal,
-        parameters().log_focal, jnp.asarray(0.2), jnp.asarray(True),
-    )  # fmt: skip
-
-
-@functools.cache
-def fit_data() -> FitData:
-    """What a step of a fit holds fixed."""
-    return FitData(
-        energies.PhotometricData(model(), samples()), jnp.asarray(0.7), samples(), landmarks(),
-        jnp.asarray(0.9), jnp.asarray(np.random.default_rng(4).normal(size=(25, 3, 8))),
-        (parameters().log_focal, jnp.asarray(0.2)), fit_weights(),
-    )  # fmt: skip
-
-
-@functools.cache
-def pyramid() -> Mipmap:
-    """Three levels."""
-    return mipmap(jnp.asarray(np.random.default_rng(6).uniform(0.2, 0.8, (8, 9, 3))), 3)
-
-
-RECORDS: dict[Any, Callable[[], Any]] = {
-    MorphableModel: model,
-    FaceParameters: parameters,
-    NormalStencil: stencil,
-    UVLayout: layout,
-    FeatureNetwork: network,
-    Mipmap: pyramid,
-    FitModel: fit_model,
-    FitInput: fit_input,
-    FitData: fit_data,
-    FitWeights: fit_weights,
-    energies.PixelSamples: samples,
-    energies.LandmarkData: landmarks,
-    energies.StyleData: style,
-}
-
-
-def tables() -> dict[str, Any]:
-    """Arguments that are not floating-point arrays, by name."""
-    return {
-        "faces": model().faces, "uv_faces": model().faces,
-        "vertices": jnp.asarray(np.random.default_rng(0).integers(0, 25, (12, 3))),
-        "height": 5, "width": 6, "levels": 2, "level": 1, "canvas": SIDE, "count": 2, "stride": 1,
-        "rounds": 2, "capacity": 20, "side": float(SIDE), "resolution": 8,
-        "layers": ("conv1_1", "conv2_1"), "seed": jnp.uint32(3),
-    }  # fmt: skip
-
-
-@functools.cache
-def scene() -> dict[str, Any]:
-    """Arguments of a renderer."""
-    y = parameters()
-    return {
-        "vertices": model().shape(y.identity, y.expression),
-        "faces": model().faces,
-        "pose": Pose(y.rotation, y.translation),
-        "camera": y.camera(jnp.array([0.48, 0.53]), SIDE),
-        "light": y.light,
-    }
-
-
-@functools.cache
-def screen() -> Any:
-    """The bump's vertices in a picture of ``SIDE`` px."""
-    made = scene()
-    return made["camera"].project(made["pose"](made["vertices"]))
 
 
 def sized(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -306,6 +140,12 @@ def observed(y: Any, image: Any, mask: Any, data: FitInput, weights: FitWeights)
     modes = jnp.zeros((25, 3, 8))
     step = observe(y, image, mask, SIDE, data, fit_model(), modes, weights, config=config)
     return fit_energy().value(y, step)
+
+
+def seen_level(photo: Any, weight: Any) -> SeenLevel:
+    """All of it to be synthesised, a texel for half a pixel."""
+    plain = jnp.ones_like(weight)
+    return SeenLevel(photo, weight, photo, jnp.ones(weight.shape, bool), plain, 2.0)
 
 
 def stages_visible(image: Any) -> Any:
@@ -410,7 +250,7 @@ simple("stages._common_light.common_light", functools.partial(stages.common_ligh
 simple("stages.fit._posterior.posterior", lambda root, model, weight: stages.posterior(
     root @ root.T + jnp.eye(len(root)), model, weight), lambda m: {
     "root": m.numbers(10, 10), "model": model(), "weight": m.numbers()})  # fmt: skip
-simple("stages.fit.solve.fit_energy", lambda y, data: fit_energy().value(y, data),
+simple("stages.fit.objective.fit_energy", lambda y, data: fit_energy().value(y, data),
        lambda m: {"y": parameters(), "data": fit_data()})  # fmt: skip
 simple("stages.fit.solve.observe", observed, lambda m: {
     "y": parameters(), "image": m.numbers(SIDE, SIDE, 3), "mask": m.numbers(SIDE, SIDE),
@@ -454,14 +294,30 @@ simple(
 )  # fmt: skip
 
 simple(
-    "stages.fit.solve.initial_light",
+    "stages.fit.start.initial_light",
     initial_light,
     lambda m: {"y": parameters(), "image": m.numbers(SIDE, SIDE, 3), "data": fit_input(),
                "mask": m.numbers(SIDE, SIDE), "model": fit_model()},
     singular="nothing of the face is seen: its mean colour is of no pixel",
 )  # fmt: skip
 
+simple(
+    "energies.exemplar.exemplar_gram_residual",
+    exemplar_gram_residual,
+    lambda m: {"image": m.numbers(12, 13, 1), "args": exemplar()},
+    singular="a flat picture lies on a kink of every ReLU",
+)
+simple("energies.term.Energy.total", lambda y, args: two_terms().total(y, args),
+       lambda m: {"y": m.numbers(4), "args": m.numbers(2)})  # fmt: skip
+simple("energies.term.Term.output", lambda y: Term(
+    "t", lambda y, args: {"r": y**2}).output(y, None), lambda m: {"y": m.numbers(4)})  # fmt: skip
+simple("stages.texture.composition.with_seen", lambda texture, photo, weight: with_seen(
+    texture, seen_level(photo, weight)), lambda m: {
+    "texture": m.numbers(SIDE, SIDE, 3), "photo": m.numbers(SIDE, SIDE, 3),
+    "weight": m.numbers(SIDE, SIDE)})  # fmt: skip
+
 WEIGHTS = {
+    "ExemplarWeights": "energies.exemplar.exemplar_gram_residual",
     "FitWeights": "stages.fit.solve.observe",
     "SynthesisWeights": "stages.texture._synthesise.synthesis_energy",
 }
@@ -486,9 +342,9 @@ NOT_DIFFERENTIABLE = {
         "stages.fit.levels.fit_parameters",
         "stages.fit.levels.through_levels",
         "stages.fit.levels.level_stages",
-        "stages.fit.solve.fit_start",
+        "stages.fit.start.fit_start",
         "stages.fit.solve.fit_level",
-        "stages.fit.solve.fit_landmarks",
+        "stages.fit.start.fit_landmarks",
         "stages.fit.solve.fit_shadows",
     ],
     "by the implicit function theorem, against differences in test_blend": [
@@ -536,7 +392,27 @@ NOT_DIFFERENTIABLE = {
         "networks.landmarks.face_detector.suppress",
         "models.face_oval.face_oval_mask",
     ],
+    "with derivatives and differences of their own in test_exemplar": [
+        "energies.exemplar.exemplar_targets",
+        "energies.exemplar.octave_grams",
+    ],
+    "settings, no arrays": [
+        "stages.fit.options.FitOptions.as_published",
+        "stages.fit.options.FitOptions.changed",
+        "stages.fit.options.FitOptions.config",
+        "stages.fit.records.FitWeights.as_published",
+        "stages.fit.records.FitWeights.from_text",
+    ],
+    "made on the host of a scan or of photos, in a search or by a choice among them": [
+        "imaging.colour_axes.colour_axes",
+        "stages._common_light.shared_light",
+        "stages.scan._embed_landmarks.embed_landmarks",
+        "stages.scan.transfer.own_parts",
+        "stages.scan.transfer.whole_texture",
+    ],
+    "a target of the synthesis, which is held": ["stages.texture.statistics.nearest_positive"],
     "made on the host, once a model or a network": [
+        "stages.fit.self_shadow.with_self_shadow",
         "geometry.uv.uv_layout",
         "models.subdivide.subdivide",
         "models.opening_rims.opening_rims",
@@ -553,11 +429,22 @@ NOT_DIFFERENTIABLE = {
         "energies.term.quadratic_by_autodiff",
         "energies.term.Term.weight_at",
     ],
-    "a loop on the host over an energy that is walked": ["stages.texture._synthesise.synthesise"],
+    "a loop on the host over an energy that is walked": [
+        "stages.texture._synthesise.synthesise",
+        "stages.texture._synthesise_texture.synthesise_texture",
+    ],
     "an algorithm of the convolution, which has the derivative": [
         "networks.convolution.winograd.winograd_conv3x3",
     ],
     "gathers or casts records": [
+        "models.parameters.set_apart",
+        "stages.fit.objective.ExtraWeight.__call__",
+        "stages.fit.objective.weights_as_data",
+        "stages.fit.photo.in_units_of",
+        "stages.fit.solve.landmarks_at",
+        "stages.fit.solve.observe_finest",
+        "stages.fit.solve.record_of",
+        "stages.texture.composition.known_detail",
         "stages.fit.records.join_records",
         "stages.fit.prepared.in_precision_of",
     ],

@@ -119,7 +119,7 @@ def _similarity_on_host(source: Any, target: Any, weights: Any, with_scale: bool
     u, singular, vt = np.linalg.svd((w[:, None] * y).T @ x)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * sign) @ vt
-    scale = float(np.sum(singular * sign) / variance) if with_scale else 1.0
+    scale = np.asarray(np.sum(singular * sign) / variance if with_scale else 1.0)
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 

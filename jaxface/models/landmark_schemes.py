@@ -87,7 +87,7 @@ CONTOURS_68 = {
 }
 """lines through the 68 by name, and whether each is closed"""
 
-MEDIAPIPE_TO_IBUG68 = np.array([(first, second) for first, second, _ in _PAIRS])
+MEDIAPIPE_TO_IBUG68 = np.array([(first, second) for first, second, _ in _PAIRS], np.int32)
 """(68, 2) the two of the 468 between which each of the 68 lies"""
 
 MEDIAPIPE_TO_IBUG68_WEIGHTS = np.array([(share, 1 - share) for _, _, share in _PAIRS], np.float32)

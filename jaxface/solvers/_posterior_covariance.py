@@ -21,23 +21,21 @@ def posterior_covariance(
     of ``E`` and the covariance the inverse of ``2C/T``. ``C`` is scaled to unit diagonal, a ridge
     of 1e-7 is added to that, which bounds the variance of what ``C`` leaves open, and the sum is
     inverted by its Cholesky factor. Where rounding, or a point that is no minimum, leaves the sum
-    without a factor, the ridge is raised tenfold until it has one.
+    without a factor, the ridge is raised tenfold until it has one, a choice that no derivative
+    follows.
     """
     scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(curvature), 1e-30))
     unit = curvature * scale[:, None] * scale
     eye = jnp.eye(len(curvature), dtype=scale.dtype)
 
-    def factorised(ridge: Array) -> Array:
-        return jnp.linalg.cholesky(unit + ridge * eye)
+    # The choice of the ridge is held by every derivative, so that both modes pass.
+    held = jax.lax.stop_gradient(unit)
 
-    def raised(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        ridge = 10.0 * state[0]
-        return ridge, factorised(ridge)
+    def missing(ridge: Array) -> Array:
+        factor = jnp.linalg.cholesky(held + ridge * eye)
+        return ~jnp.all(jnp.isfinite(factor)) & (ridge < GIVEN_UP)
 
-    def missing(state: tuple[Array, Array]) -> Array:
-        return ~jnp.all(jnp.isfinite(state[1])) & (state[0] < GIVEN_UP)
-
-    ridge = jnp.asarray(RIDGE, scale.dtype)
-    _, factor = jax.lax.while_loop(missing, raised, (ridge, factorised(ridge)))
+    ridge = jax.lax.while_loop(missing, lambda r: 10.0 * r, jnp.asarray(RIDGE, scale.dtype))
+    factor = jnp.linalg.cholesky(unit + ridge * eye)
     inverse = cho_solve((factor, True), eye)
     return 0.5 * temperature * inverse * scale[:, None] * scale

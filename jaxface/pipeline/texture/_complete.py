@@ -16,6 +16,7 @@ from jaxface.pipeline.databases.grams import find_precomputed, masked_grams
 from jaxface.pipeline.texture.options import CompletionOptions
 from jaxface.pipeline.texture.records import Blending, Completed, Level, Progress
 from jaxface.pipeline.texture.seen import SeenTexture
+from jaxface.run.compile_cache import keep_compiled
 from jaxface.run.memory import hand_back_freed_memory
 from jaxface.stages.blending import Blend, blend
 from jaxface.stages.texture._synthesise import SynthesisProblem, SynthesisWeights, synthesise
@@ -74,6 +75,7 @@ def complete(
     """
     options = options or CompletionOptions()
     check_subjects(database)
+    keep_compiled()
     work = _Work(seen, database, network, options, on_progress)
     blended = blending if isinstance(blending, Blend) else work.blend(blending)
     order = np.argsort(-blended.weights)
