@@ -157,7 +157,8 @@ def test_who_waits_for_a_lock_is_told(tmp_path, monkeypatch):
 FOLDER = """
 import sys
 from pathlib import Path
-from jaxface.pipeline.folder import photos_in, run_folder, shard_of
+from jaxface.pipeline.folder import run_folder, shard_of
+from jaxface.pipeline.photo import photos_in
 from tests.photo_stamps import Stamps
 photos = photos_in(sys.argv[1])
 photos = shard_of(photos, sys.argv[3]) if len(sys.argv) > 3 else photos
