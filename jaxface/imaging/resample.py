@@ -79,8 +79,19 @@ def resize(image: Float[Array, "h w c"], height: int, width: int) -> Float[Array
 
 def block_means(texture: Float[np.ndarray, "r r c"], side: int) -> Float[np.ndarray, "s s c"]:
     """Average over blocks of texels, on the host; a texture that is small enough stays as it is."""
-    factor = max(len(texture) // side, 1)
+    return means_of_blocks(texture, max(len(texture) // side, 1))
+
+
+def means_of_blocks(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "a b c"]:
+    """Average over blocks of ``factor`` pixels a side, on the host, in single precision.
+
+    Args:
+        image: height and width are multiples of the factor.
+        factor: 1 leaves the image as it is.
+    """
+    values = np.asarray(image, np.float32)
     if factor == 1:
-        return np.asarray(texture, np.float32)
-    blocks = np.asarray(texture, np.float32).reshape(side, factor, side, factor, -1)
+        return values
+    height, width = values.shape[:2]
+    blocks = values.reshape(height // factor, factor, width // factor, factor, -1)
     return blocks.mean(axis=(1, 3))

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxface._types import Float, Shaped
+from jaxface.imaging.resample import means_of_blocks
 from jaxface.models.morphable import MorphableModel
 
 Encoding = Literal["linear", "srgb", "none"]
@@ -129,21 +130,13 @@ class UVMaps(Mapping[str, UVMap]):
             values = np.asarray(found.values[rows, columns], np.float32)
             values = values.reshape(*values.shape[:2], channels)
             if found.weight is None:
-                means[at], share[at] = _block_means(values, factor), 1.0
+                means[at], share[at] = means_of_blocks(values, factor), 1.0
                 continue
             weight = np.asarray(found.weight[rows, columns], np.float32)[..., None]
-            mean = _block_means(weight, factor)
-            means[at] = _block_means(values * weight, factor) / np.maximum(mean, 1e-3)
+            mean = means_of_blocks(weight, factor)
+            means[at] = means_of_blocks(values * weight, factor) / np.maximum(mean, 1e-3)
             share[at] = mean[..., 0]
         return means, share
-
-
-def _block_means(values: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "a b c"]:
-    if factor == 1:
-        return values
-    height, width, channels = values.shape
-    blocks = values.reshape(height // factor, factor, width // factor, factor, channels)
-    return blocks.mean(axis=(1, 3))
 
 
 def uv_digest(model: MorphableModel) -> str:

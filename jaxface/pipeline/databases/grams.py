@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from jaxface._machine import usable_cores
 from jaxface._types import Bool, Float
 from jaxface.imaging.colour import rgb_to_yiq
+from jaxface.imaging.resample import block_means
 from jaxface.io.atomic import atomic_path
 from jaxface.io.digest import digest
 from jaxface.io.feature_weights import network_digest
@@ -179,9 +180,7 @@ def _write_stamp(folder: Path, identity: str, subject: str, found: tuple[str, st
 
 def intensity(encoded: Float[np.ndarray, "r r 3"], side: int) -> Float[np.ndarray, "s s"]:
     """Y of YIQ of an sRGB-encoded texture, averaged over blocks of texels."""
-    factor = len(encoded) // side
-    blocks = np.asarray(encoded, np.float32).reshape(side, factor, side, factor, 3)
-    return np.asarray(rgb_to_yiq(jnp.asarray(blocks.mean(axis=(1, 3))))[..., 0], np.float32)
+    return np.asarray(rgb_to_yiq(jnp.asarray(block_means(encoded, side)))[..., 0], np.float32)
 
 
 def masked_grams(
